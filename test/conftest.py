@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 import os
+import resource
 import signal
 import sys
 
@@ -29,13 +30,15 @@ for number in (signal.SIGHUP, signal.SIGINT):
         signal.signal(number, lambda *_: None)
 
 LONGEST_FIRST = (
-    *('test_pages', 'test_explored_nodes', 'test_forked', 'test_salvage', 'test_processes'),
+    *('test_pages', 'test_explored_nodes', 'test_forked', 'test_damage_fuzz', 'test_processes'),
     *('test_replay_run', 'test_recover_crash', 'test_calibrate_run', 'test_exploration'),
     *('test_external', 'test_own_controllers', 'test_fixtures', 'test_se2', 'test_process_faults'),
     *('test_record_run', 'test_recording', 'test_live_browser'),
     *('test_flood', 'test_calibration', 'test_faults_same', 'test_tools'),
 )
 """Files with tests that take seconds. They start first, so that none is left for the end."""
+MEMORY = 700 << 20
+"""What a test with `bounded_memory` may take (bytes)."""
 CHUNK = 4
 """Most tests that a worker of pytest-xdist gets at once."""
 
@@ -106,6 +109,23 @@ def ros(request):
 def forked_python(tmp_path_factory):
     """Return a command that is used like the Python interpreter, and has done its imports."""
     return forked.make_commands(tmp_path_factory.mktemp('forked') / 'commands', ['python']) / 'python'
+
+
+@pytest.fixture
+def quick_disk(monkeypatch):
+    """Wait for no disk: the files of a test need not survive a power cut."""
+    monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
+
+
+@pytest.fixture
+def bounded_memory():
+    """Let this process take a few hundred megabytes more, and no more."""
+    with open('/proc/self/statm') as file:
+        now = int(file.read().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 @pytest.fixture

@@ -1,41 +1,52 @@
-"""Message types named by a bag: only packages whose share directory has the .msg are imported."""
+"""Message types named by a bag, known without ROS or installed, and the definitions in bags.
+
+Only packages whose share directory has the .msg are imported.
+"""
 
 from __future__ import annotations
 
 import sys
 
 import pytest
+from rclpy.serialization import serialize_message
 from std_msgs.msg import String
+from support.bags import SECOND, odom, write_bag
 
-from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
+from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.bags.bag_writer import build_bag
+from diffdrive_jacobian.bags.journal import Channel, Message
+from diffdrive_jacobian.bags.message_definitions import (
+    UnknownTypeError,
+    definition,
+    known_definition,
+    known_structure,
+    message_class,
+    recorded_definition_differs,
+)
+from diffdrive_jacobian.bags.salvage_mcap import Topic
+from diffdrive_jacobian.bags.topic_types import definition_and_hash
+from diffdrive_jacobian.messages.topics import TOPICS
 
+TYPES = sorted({kind for topic in TOPICS.values() for kind in topic.types})
 INVALID = [
-    '',
-    'std_msgs',
-    'std_msgs/String',
-    'std_msgs/srv/String',
-    'std_msgs/msg/string',
-    'std_msgs/msg/String\n',
-    'std_msgs/msg/../String',
-    'std_msgs/msg/Strıng',
-    'Std_msgs/msg/String',
-    '../std_msgs/msg/String',
-    'test.autotest.x/msg/X',
-    'std_msgs.msg/msg/String',
-    '_this/msg/X',
-    'this/msg/',
-    'a/b/msg/X',
+    *('', 'std_msgs', 'std_msgs/String', 'std_msgs/srv/String', 'std_msgs/msg/string'),
+    *('std_msgs/msg/String\n', 'std_msgs/msg/../String', 'std_msgs/msg/Strıng', 'Std_msgs/msg/String'),
+    *('../std_msgs/msg/String', 'test.autotest.x/msg/X', 'std_msgs.msg/msg/String', '_this/msg/X'),
+    *('this/msg/', 'a/b/msg/X'),
 ]
+both = pytest.mark.parametrize('find', [definition, message_class])
+
+# --- Installed types
 
 
-@pytest.mark.parametrize('find', [definition, message_class])
-@pytest.mark.parametrize('name', INVALID)
-def test_invalid_names_are_refused(find, name):
-    with pytest.raises(UnknownTypeError, match='must be named package/msg/Name'):
-        find(name)
+@both
+def test_invalid_names_are_refused(find):
+    for name in INVALID:
+        with pytest.raises(UnknownTypeError, match='must be named package/msg/Name'):
+            find(name)
 
 
-@pytest.mark.parametrize('find', [definition, message_class])
+@both
 @pytest.mark.parametrize(
     'name', ['this/msg/X', 'antigravity/msg/Zen', 'std_msgs/msg/Nothing', 'sys/msg/X']
 )
@@ -50,7 +61,7 @@ def test_modules_that_are_no_message_packages_are_not_imported(find, name, monke
     assert not {one for one in set(sys.modules) - before if one.split('.')[0] == package}
 
 
-@pytest.mark.parametrize('find', [definition, message_class])
+@both
 @pytest.mark.parametrize('entry', ['', '.', 'CWD'])
 @pytest.mark.parametrize('place', ['.', 'lib'])
 def test_code_beside_a_bag_is_not_imported(tmp_path, monkeypatch, find, entry, place):
@@ -161,3 +172,79 @@ def test_a_type_with_an_invalid_description_is_unknown(overlay, described):
 def test_an_installed_message():
     assert message_class('std_msgs/msg/String') is String
     assert definition('std_msgs/msg/String').text.splitlines()[-1] == 'string data'
+
+
+# --- Definitions in bags
+
+
+def test_known_definitions_are_those_of_the_installed_packages():
+    """An rosbags or ROS release that changes a type fails here."""
+    for name in TYPES:
+        assert known_definition(name).type_hash == definition(name).type_hash
+    with pytest.raises(UnknownTypeError, match='my_msgs/msg/Mine is not a type of ROS 2 Jazzy'):
+        known_definition('my_msgs/msg/Mine')
+
+
+OTHER_HASH = 'RIHS01_' + '0' * 64
+
+
+def test_only_a_valid_hash_tells_another_definition():
+    name = 'nav_msgs/msg/Odometry'
+    own = definition(name).type_hash
+    assert recorded_definition_differs(name, [own, OTHER_HASH])
+    assert not recorded_definition_differs(name, [own, '', 'INVALID', 'RIHS02_' + '0' * 64, 'RIHS01_'])
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_messages_of_another_definition_are_reported_and_not_misread(tmp_path, storage):
+    channels = [
+        Channel(
+            id=index,
+            topic=topic,
+            type_name='nav_msgs/msg/Odometry',
+            definition='float64 x\n',
+            type_hash=type_hash,
+        )
+        for index, (topic, type_hash) in enumerate(
+            [('/odom', OTHER_HASH), ('/other', definition('nav_msgs/msg/Odometry').type_hash)]
+        )
+    ]
+    data = [Message(0, SECOND, serialize_message(odom(1.0, 2.0, 0.5)))]
+    build_bag(channels, data, tmp_path / 'bag', storage)
+    run = read_run(tmp_path / 'bag')
+    assert len(run.odometry) == 0
+    assert run.skipped == {'/odom': 1}
+    assert run.notes == (
+        '1 of 1 messages on /odom were recorded with another definition of nav_msgs/msg/Odometry '
+        'and were skipped',
+    )
+
+
+def test_definitions_of_a_bag_never_become_code(tmp_path, monkeypatch):
+    """Neither reading nor recovery hands a stranger's definition to rosbags' code generator."""
+    write_bag(tmp_path / 'bag', [(1.0, '/odom', odom(1.0, 2.0, 0.5))])
+    known_structure('nav_msgs/msg/Odometry')
+
+    def generated(*_, **__):
+        raise AssertionError('code was generated from a definition')
+
+    monkeypatch.setattr('rosbags.typesys.store.generate_python_code', generated)
+    assert len(read_run(tmp_path / 'bag').odometry) == 1
+    foreign = Topic(1, '/x', 'evil_msgs/msg/Evil', 'cdr', '', '', 'int32 a\nint32 class\n')
+    text, type_hash = definition_and_hash(foreign)
+    assert text == foreign.definition
+    assert type_hash.startswith('RIHS01_')
+
+
+def test_a_parsed_definition_has_the_hash_of_the_type():
+    for name in (*TYPES, 'tf2_msgs/msg/TFMessage'):
+        known = known_definition(name)
+        other = Topic(1, '/x', name.replace('/msg/', '/msg/X'), 'cdr', '', '', known.text)
+        assert definition_and_hash(Topic(1, '/x', name, 'cdr', '', '', ''))[1] == known.type_hash
+        assert definition_and_hash(other)[1] != known.type_hash
+        # Recorded with another definition, which is kept.
+        foreign = Topic(1, '/x', name, 'cdr', '', OTHER_HASH, 'float64 x\n')
+        assert definition_and_hash(foreign) == ('float64 x\n', OTHER_HASH)
+    for text in ('evil_msgs/Evil a\n', 'x' * 1000, '%', '\0'):
+        with pytest.raises(UnknownTypeError):
+            definition_and_hash(Topic(1, '/x', 'evil_msgs/msg/Evil', 'cdr', '', '', text))

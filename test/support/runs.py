@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
+from diffdrive_jacobian.bags.run import COLUMNS, Run, Series
 from diffdrive_jacobian.bags.run_reader import read_run
 from diffdrive_jacobian.kinematics.se2 import integrate
 from support.bags import SECOND, odom, write_bag
@@ -30,3 +33,20 @@ def sample(extra=(), **how):
 
 def run_of(tmp_path, extra=(), *, parameters=None, **how):
     return read_run(write_bag(tmp_path / 'run', sample(extra, **how), parameters=parameters))
+
+
+def series(name, stamps, values, received=None):
+    """Return a series of a run; messages are received at their stamps unless other times are given."""
+    stamps = np.asarray(stamps, dtype=np.int64)
+    columns = COLUMNS[name]
+    return Series(
+        received=stamps if received is None else np.asarray(received, dtype=np.int64),
+        stamps=stamps,
+        values=np.asarray(values, dtype=np.float64).reshape(len(stamps), len(columns)),
+        columns=columns,
+    )
+
+
+def built_run(**given):
+    """Return a run of these series; the others are empty."""
+    return Run(path=Path('run'), **({name: series(name, [], []) for name in COLUMNS} | given))
