@@ -1,6 +1,6 @@
 """Worlds in which our own nodes are explored: a robot, its bridge, its controller and who sends goals.
 
-`explore_nodes.py` runs thousands of them, `test_explored_nodes.py` some hundreds.
+`promises.py run explored` runs thousands of them, `test_explored_nodes.py` a few.
 """
 
 from __future__ import annotations
