@@ -13,6 +13,7 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import make
+from support.ros_messages import goal
 
 from diffdrive_jacobian.faults import (
     ActuatorLag,
@@ -58,16 +59,6 @@ def test_stops_after_lost_odometry(lockstep, robot_at, timeout, within):
     assert abs(raised.value.seconds - 1.0 - within) < 0.021
 
 
-def test_a_jump_after_a_pause_is_no_time_that_has_passed(lockstep, robot_at):
-    """At the time of the jump the clock has advanced by as much as world time since the pause began."""
-    lockstep.require(StopsAfterLostOdometry(0.3))
-    robot_at()
-    lockstep.add(Student(timeout=0.3))
-    lockstep.inject(ClockPause(start=1.0, duration=1.0), TimeJump(1.0, start=2.0))
-    lockstep.run_for(3.0)
-    lockstep.finish()
-
-
 def test_motors_that_lag_roll_on(lockstep, robot_at):
     lockstep.require(StopsAfterLastCommand(0.6))
     robot_at(cmd_vel_timeout=0.5)
@@ -77,20 +68,23 @@ def test_motors_that_lag_roll_on(lockstep, robot_at):
     lockstep.finish()
 
 
-def test_only_what_a_node_can_do_is_required_of_it(lockstep, robot_at):
-    """A frozen node, a clock that stands or jumps back, and a node that is gone."""
+@pytest.mark.parametrize(
+    'faults',
+    [
+        # At the time of the jump the clock has advanced by as much as world time since the pause began.
+        [ClockPause(start=1.0, duration=1.0), TimeJump(1.0, start=2.0)],
+        [Loss('odom', start=1.01, duration=2.0), Hang('student', start=1.1, duration=1.0)],
+        [Loss('odom', start=1.01, duration=3.0), ClockPause(start=1.1, duration=2.0)],
+        [Loss('odom', start=1.01, duration=2.0), TimeJump(-3.0, start=1.2)],
+    ],
+)
+def test_only_what_a_node_can_do_is_required_of_it(lockstep, robot_at, faults):
+    """Of a frozen one, with a clock that stands or jumps, and of one that is gone."""
     lockstep.require(StopsAfterLostOdometry(0.3))
     robot_at()
     student = lockstep.add(Student(timeout=0.3))
-    lockstep.inject(
-        Loss('odom', start=1.01, duration=2.0),
-        Hang('student', start=1.1, duration=1.0),
-        Loss('odom', start=4.01, duration=3.0),
-        ClockPause(start=4.1, duration=2.0),
-        Loss('odom', start=8.01, duration=2.0),
-        TimeJump(-3.0, start=8.2),
-    )
-    lockstep.run_for(10.51)
+    lockstep.inject(*faults)
+    lockstep.run_for(4.51)
     lockstep.remove(student)
     lockstep.run_for(1.0)
     lockstep.finish()
@@ -199,9 +193,33 @@ def drive(lockstep, robot_at, *faults, seconds=12.0, goal=None):
     lockstep.finish()
 
 
-def test_arrives_once_faults_end(lockstep, robot_at):
-    lockstep.require(ArrivesOnceFaultsEnd(5.0))
-    drive(lockstep, robot_at, Loss('odom', start=0.5, duration=3.0), seconds=9.0)
+REFUSED = goal(1.0, 0.0, frame='map')
+
+
+@pytest.mark.parametrize(
+    ('required', 'faults', 'seconds', 'goal'),
+    [
+        (ArrivesOnceFaultsEnd(5.0), [Loss('odom', start=0.5, duration=3.0)], 9.0, None),
+        # Faults without an end, a goal that was not received or is refused, a controller without memory.
+        (ArrivesOnceFaultsEnd(2.0), [Loss('odom', start=1.0)], 6.0, None),
+        (ArrivesOnceFaultsEnd(2.0), [Loss('goal_pose', duration=1.0)], 6.0, None),
+        (ArrivesOnceFaultsEnd(2.0), [], 3.0, REFUSED),
+        (ArrivesOnceFaultsEnd(2.0), [Kill('go_to_goal', start=1.0, duration=1.0)], 6.0, None),
+        # Without odometry it stands, which counts only when the fault is over.
+        (
+            KeepsDriving(0.5),
+            [
+                Loss('odom', start=0.5, duration=3.0),
+                Hang('go_to_goal', start=4.0, duration=1.0),
+            ],
+            12.0,
+            None,
+        ),
+    ],
+)
+def test_what_cannot_arrive_need_not(lockstep, robot_at, required, faults, seconds, goal):
+    lockstep.require(required)
+    drive(lockstep, robot_at, *faults, seconds=seconds, goal=goal)
 
 
 def test_arrives_too_late(lockstep, robot_at):
@@ -217,27 +235,6 @@ def test_a_run_that_ends_too_early_shows_nothing(lockstep, robot_at):
     lockstep.require(ArrivesOnceFaultsEnd(5.0))
     with pytest.raises(PropertyViolation, match=r'the run ended 0.5 s after the faults have ended'):
         drive(lockstep, robot_at, Loss('odom', start=0.5, duration=3.0), seconds=4.0)
-
-
-@pytest.mark.parametrize(
-    'faults',
-    [
-        [Loss('odom', start=1.0)],
-        [Loss('goal_pose', duration=1.0)],
-        [Kill('go_to_goal', start=1.0, duration=1.0)],
-    ],
-)
-def test_what_cannot_arrive_need_not(lockstep, robot_at, faults):
-    """Faults without an end, a goal that was not received, a controller without its memory."""
-    lockstep.require(ArrivesOnceFaultsEnd(2.0))
-    drive(lockstep, robot_at, *faults, seconds=6.0)
-
-
-def test_a_goal_that_is_refused_is_not_due(lockstep, robot_at):
-    lockstep.require(ArrivesOnceFaultsEnd(2.0))
-    goal = goal_at(1.0)
-    goal.header.frame_id = 'map'
-    drive(lockstep, robot_at, seconds=3.0, goal=goal)
 
 
 def test_who_records_goals_need_not_arrive(lockstep, robot_at, recorded_run):
@@ -261,17 +258,6 @@ def test_the_test_itself_is_no_controller(lockstep, robot_at):
     lockstep.remove(robot)
     lockstep.run_for(0.5)
     lockstep.finish()
-
-
-def test_keeps_driving(lockstep, robot_at):
-    """Without odometry it stands, which counts only when the fault is over."""
-    lockstep.require(KeepsDriving(0.5))
-    drive(
-        lockstep,
-        robot_at,
-        Loss('odom', start=0.5, duration=3.0),
-        Hang('go_to_goal', start=4.0, duration=1.0),
-    )
 
 
 def test_a_robot_that_stands_on_its_way(lockstep, robot_at):
