@@ -1,7 +1,7 @@
 """Inverse kinematics from random starts: `python test/benchmark/inverse_kinematics.py [--quick]`.
 
 Planar arms of 2, 3 and 7 links, and one whose middle link is a thousandth as long as the others: every
-method, 20,000 targets each (with --quick 500), the same in every run. Reachable targets are what random
+method, 20,000 targets each (with --quick 100), the same in every run. Reachable targets are what random
 joints, uniform in (-pi, pi], reach: as points, and with the heading where there are joints enough.
 Starts are drawn likewise. Unreachable ones are points up to a whole reach too far out, and points in
 the hole that an arm with one long link leaves. The nearest reachable point of these is known in closed
@@ -240,7 +240,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument('--quick', action='store_true', help='500 targets each, to try it')
+    parser.add_argument('--quick', action='store_true', help='100 targets each, to try it')
     names = [peer.package for peer in ik_peers.PEERS]
     parser.add_argument(
         '--peers',
@@ -250,7 +250,7 @@ def main() -> None:
         help=f'compare with other packages instead: {", ".join(names)} (default: all)',
     )
     options = parser.parse_args()
-    count = 500 if options.quick else 20_000
+    count = 100 if options.quick else 20_000
     console = Console()
     if not console.is_terminal:
         console.width = WIDTH

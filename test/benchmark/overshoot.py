@@ -4,10 +4,12 @@ Default gains, starts 2 m from the goal, with headings in all directions, at 50 
 velocity limits of the TurtleBot3 Burger, the accelerations with which ROBOTIS plans its paths,
 then a lag and a delay too, and then a slow acceleration.
 
-    python test/benchmark/overshoot.py     the table of doc/controllers.md
+    python test/benchmark/overshoot.py     the table of doc/controllers.md; --quick: 12 starts, to try it
 """
 
 from __future__ import annotations
+
+import argparse
 
 import numpy as np
 
@@ -48,10 +50,13 @@ ROBOTS = {
 
 def main() -> None:
     """Print the table."""
+    parser = argparse.ArgumentParser(description='Overshoot of the built-in controllers.')
+    parser.add_argument('--quick', action='store_true', help='few starts, to try it')
+    count = 12 if parser.parse_args().quick else STARTS
     print('| controller | robot | arrived | time, mean, max | overshoot, max | rest, max |')
     print('|---|---|---:|---:|---:|---:|')
     for name, controller in BUILT_IN.items():
-        starts = SweepSetup(controller=name, starts=STARTS).poses()
+        starts = SweepSetup(controller=name, starts=count).poses()
         arrival = Arrival(
             use_heading=controller.takes_heading, offset=controller.driven_offset(controller.defaults)
         )

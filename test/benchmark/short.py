@@ -1,0 +1,51 @@
+"""Every benchmark once, in its shortest form, so that none is broken unnoticed.
+
+    python test/benchmark/short.py
+
+CI runs it. The figures mean nothing: the machine is busy, and few values are measured. The flood of the
+nodes has a test of its own. Exit code 1: a benchmark has failed, and what it printed is shown.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+HERE = Path(__file__).parent
+COMMANDS = (
+    ('run.py', '--quick'),
+    ('bags.py', '--seconds', '1'),
+    ('calibration_cases.py', '--robots', '1', 'UMBmark'),
+    ('crash.py', '1'),
+    ('drift.py', '--seeds', '20', '--rounds', '1', '--limited'),
+    ('inverse_kinematics.py', '--quick'),
+    ('limiter.py',),
+    ('overshoot.py', '--quick'),
+    ('path_tracking.py', '--quick'),
+    ('sampled_laws.py', '--robots', '2'),
+    ('uncertainty.py', '--quick'),
+)
+LIMIT = 900.0
+"""Longest time for one (s)."""
+
+
+def main() -> int:
+    """Run them, and return the exit code."""
+    failed = False
+    for name, *options in COMMANDS:
+        begin = time.monotonic()
+        command = [sys.executable, str(HERE / name), *options]
+        done = subprocess.run(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=LIMIT
+        )
+        print(f'{name}: exit code {done.returncode}, {time.monotonic() - begin:.0f} s', flush=True)
+        if done.returncode:
+            failed = True
+            print(done.stdout)
+    return int(failed)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
