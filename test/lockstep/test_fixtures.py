@@ -172,7 +172,7 @@ WORLDS = """
 """
 
 
-@pytest.mark.parametrize('capture', ['fd', 'sys', 'no'])
+@pytest.mark.parametrize('capture', ['sys', 'no'])
 def test_each_test_has_a_world_and_robots_of_its_own_whatever_is_captured(run, capture):
     text = run(WORLDS, f'--capture={capture}', passed=4, failed=1, errors=1)
     assert 'TypeError: the marker lockstep takes keyword arguments only' in text
