@@ -228,21 +228,29 @@ def test_what_a_slow_node_publishes_leaves_late_and_what_arrives_waits(lockstep,
     ]
 
 
-def test_a_slow_node_does_what_has_waited_longest(lockstep, relay):
+@pytest.mark.parametrize(
+    ('seconds', 'received', 'ticks'),
+    [
+        (0.06, [(1, 100.0), (2, 220.0), (3, 340.0), (4, 460.0)], [160.0, 280.0, 400.0]),
+        (0.25, [(1, 100.0)], [350.0]),
+    ],
+)
+def test_a_slow_node_does_what_has_waited_longest(lockstep, relay, seconds, received, ticks):
     """Messages and ticks are due together. The message comes first, the tick is older than the next."""
-    lockstep.inject(faults.Slow('relay', 0.06))
+    lockstep.inject(faults.Slow('relay', seconds))
     lockstep.run_for(0.5)
-    assert relay.received == [(1, 100.0), (2, 220.0), (3, 340.0), (4, 460.0)]
-    assert relay.ticks == [160.0, 280.0, 400.0]
+    assert relay.received == received
+    assert relay.ticks == ticks
 
 
 def test_a_slow_node_loses_messages_from_a_full_queue(lockstep):
     relay = lockstep.create(lambda: Relay(profile=1, period=99.0))
     lockstep.create(Source)
     relay.received.clear()
-    lockstep.inject(faults.Slow('relay', 0.25, start=0.05))
+    lockstep.inject(faults.Slow('relay', 0.25, start=0.05, duration=0.95))
     lockstep.run_for(1.0)
     assert relay.received == [(1, 100.0), (3, 350.0), (5, 600.0), (8, 850.0)]
+    assert 'lost from full queues: ' in whats(lockstep)[-2]
 
 
 def test_a_slow_service_responds_late_and_serves_one_after_the_other(lockstep):
@@ -300,6 +308,11 @@ def test_a_parameter_is_changed_and_changed_back(lockstep, gains):
     lockstep.run_for(0.5)
     assert gains == [1.0, 3.0, 3.0, 1.0, 1.0]
     assert whats(lockstep) == ['begins', 'gain is 3.0, was 1.0', 'gain is 1.0, was 3.0', 'ends']
+    lockstep.inject(faults.ParameterChange('other', 'gain', 3.0, start=0.6))
+    lockstep.run_for(0.2)
+    assert whats(lockstep)[4:] == ['begins', 'the node is not there']
+    lockstep.add(Node('other', parameter_overrides=[]))
+    lockstep.check_faults()
 
 
 def test_changes_of_a_parameter_that_overlap_end_with_the_first_value(lockstep, gains):

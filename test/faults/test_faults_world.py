@@ -8,6 +8,7 @@ import re
 from dataclasses import FrozenInstanceError, dataclass, fields, replace
 from inspect import isabstract
 
+import numpy as np
 import pytest
 from faults_nodes import Relay, Sink, Source, whats
 from std_msgs.msg import Int64
@@ -211,6 +212,9 @@ def test_faults_are_values_whose_short_expressions_make_them_again():
         for one in fields(fault):
             with pytest.raises(FrozenInstanceError):
                 setattr(fault, one.name, 1)
+    # Numbers of NumPy become those of Python.
+    number = faults.Corrupt('odom', 'x', 'offset', np.float64(0.5))
+    assert repr(number) == "Corrupt('odom', 'x', 'offset', amount=0.5)"
     public = {kind for kind in vars(faults).values() if isinstance(kind, type)}
     assert kinds == {kind for kind in public if issubclass(kind, faults.Fault) and not isabstract(kind)}
 

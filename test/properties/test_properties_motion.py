@@ -20,7 +20,9 @@ from diffdrive_jacobian.faults import (
     Duplicate,
     Hang,
     Kill,
+    LateService,
     Loss,
+    Reorder,
     TimeJump,
 )
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -282,6 +284,8 @@ def test_a_robot_that_stands_on_its_way(lockstep, robot_at):
             [Delay('odom', 2.0, duration=1.0), Duplicate('odom', copies=2, seconds=0.5, duration=2.0)],
             5.0,
         ),
+        ([Reorder('odom', 0.5, 0.25, duration=1.0), LateService('a', 1.0, duration=1.0)], 2.25),
+        ([Reorder('odom', 0.5, 0.25, duration=1.0), LateService('a', inf, duration=1.0)], 1.25),
         ([TimeJump(-1.0, start=2.0)], 2.0),
         ([Loss('odom')], inf),
         ([Delay('odom', 1.0)], inf),
