@@ -172,6 +172,7 @@ WORLDS = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('capture', ['sys', 'no'])
 def test_each_test_has_a_world_and_robots_of_its_own_whatever_is_captured(run, capture):
     text = run(WORLDS, f'--capture={capture}', passed=4, failed=1, errors=1)
@@ -305,6 +306,7 @@ FAILURES = """
 """
 
 
+@pytest.mark.slow
 def test_a_failure_reports_the_last_messages_once_and_required_properties_are_checked(run):
     # Without the summary, which repeats whole messages where the variable CI is set.
     text = run(FAILURES, '-rN', failed=5, passed=3, errors=1)
@@ -358,6 +360,7 @@ BROKEN = """
 """
 
 
+@pytest.mark.slow
 def test_what_fails_while_a_failure_is_reported_is_reported_and_the_session_goes_on(run):
     text = run(BROKEN, failed=3, passed=1)
     assert text.count("not available: KeyError: 'of a bug'") == 2
