@@ -136,12 +136,12 @@ def test_a_late_goal_is_accepted_by_the_controller_of_this_package(lockstep, lat
 def test_go_to_goal_stays_on_an_eight_unless_it_looks_far_ahead(lockstep, robot_at, lookahead):
     robot_at()
     node = lockstep.add(make(GoToGoal))
-    lockstep.require(StaysOnPath(0.03, within=40.0))
+    lockstep.require(StaysOnPath(0.03, within=24.0))
     if lookahead:
         change(node, lookahead_distance=lookahead)
-    lockstep.publish('path', path(*figure_eight_path(1.0).poses.tolist()))
+    lockstep.publish('path', path(*figure_eight_path(0.6).poses.tolist()))
     if lookahead is None:
-        lockstep.run_for(40.0)
+        lockstep.run_for(24.0)
         lockstep.finish()
         return
     with pytest.raises(PropertyViolation, match=r'm from the path and .* allowed: 0.03 m from'):
