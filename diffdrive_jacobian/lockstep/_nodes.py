@@ -55,6 +55,7 @@ class Nodes:
             raise LockstepError('the node was destroyed before it was added') from error
         if node in self._scheduler.nodes:
             raise LockstepError(f'node {name} was already added')
+        self._scheduler.forget_destroyed()
         if any(other.get_fully_qualified_name() == name for other in self._scheduler.nodes):
             raise LockstepError(f'another node has the name {name}: give one of them a namespace')
         if node.context is not self.own.context:

@@ -157,6 +157,11 @@ class Scheduler:
         node.destroy_node()
         self._note_change()
 
+    def forget_destroyed(self) -> None:
+        """Forget the nodes that were destroyed."""
+        for node in [node for node in self._members if _is_destroyed(node)]:
+            self._forget(node)
+
     def _forget(self, node: Node) -> None:
         member = self._members.pop(node)
         self.tasks.cancel(node)
@@ -373,8 +378,7 @@ class Scheduler:
         Another thread delivers latched messages to later subscriptions. This waits for them, and
         processes those of one topic before those of the next, which fixes their order.
         """
-        for node in [node for node in self._members if _is_destroyed(node)]:
-            self._forget(node)
+        self.forget_destroyed()
         for node, member in self._members.items():
             if list(node.guards):
                 raise LockstepError(

@@ -18,6 +18,23 @@ TIMEOUT = None
 """Age at which the follower ignores the last reading (s): None, which is its defect."""
 
 
+def serial(scenario, properties=(), **arguments):
+    """Explore in this thread."""
+    # Not for the processes of worlds, which import this module.
+    from diffdrive_jacobian.testing import SerialExecutor, explore
+
+    return explore(scenario, properties, **{'executor': SerialExecutor(), **arguments})
+
+
+def nothing(world, case):
+    """Do nothing."""
+
+
+def failing(world, case):
+    """Fail with large numbers."""
+    assert case < 60
+
+
 class Sensor(Node):
     """Publishes a speed ten times a second."""
 

@@ -1,6 +1,6 @@
 """Worlds in which our own nodes are explored: a robot, its bridge, its controller and who sends goals.
 
-`explore_nodes.py` runs thousands of them, `test_explored_nodes.py` some hundreds.
+`promises.py run explored` runs thousands of them, `test_explored_nodes.py` a few.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from geometry_msgs.msg import PoseStamped, Twist
 from hypothesis import strategies as st
 from nav_msgs.msg import Goals
 from process_faults.outcome import Outcome
-from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
+from support.lockstep_nodes import make, make_complete
 from support.ros_messages import value_of
 
 from diffdrive_jacobian import faults
@@ -52,38 +52,28 @@ NODES = ('go_to_goal', 'virtual_robot', 'wheel_bridge')
 TOPICS = ('odom', 'cmd_vel', 'joint_command')
 
 
-def parameters(**values):
-    return [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
-
-
-def add_nodes(world, start, *, services=False):
+def add_nodes(world, start, make=make):
     """Add the three nodes. They are created again if they are killed.
 
-    Without services for parameters, which only send_goal calls, a world takes a fifth less time.
+    Those of `make_complete` have services for parameters, which only send_goal calls.
     """
     x, y, theta = map(float, start)
-    pose = {'x': x, 'y': y, 'theta': theta}
     world.create(
-        lambda: VirtualRobot(
-            parameter_overrides=parameters(
-                command_interface='wheels',
-                publish_rate=RATE,
-                cmd_vel_timeout=TIMEOUT,
-                simulate_slip=True,
-                slip_seed=1,
-                **pose,
-            ),
-            start_parameter_services=services,
+        lambda: make(
+            VirtualRobot,
+            command_interface='wheels',
+            publish_rate=RATE,
+            cmd_vel_timeout=TIMEOUT,
+            simulate_slip=True,
+            slip_seed=1,
+            x=x,
+            y=y,
+            theta=theta,
         )
     )
-    world.create(lambda: WheelBridge(start_parameter_services=services))
+    world.create(lambda: make(WheelBridge))
     limits = {'linear__x__max_velocity': MAX_V, 'angular__z__max_velocity': MAX_OMEGA}
-    world.create(
-        lambda: GoToGoal(
-            parameter_overrides=parameters(odom_timeout=TIMEOUT, **limits),
-            start_parameter_services=services,
-        )
-    )
+    world.create(lambda: make(GoToGoal, odom_timeout=TIMEOUT, **limits))
 
 
 class Operator:
@@ -175,7 +165,7 @@ class Progress:
 
 def client(world, case):
     """A goal that send_goal sends and follows, under faults: what it reports is true."""
-    add_nodes(world, case['start'], services=True)
+    add_nodes(world, case['start'], make_complete)
     status = world.listen(GoalStatus, 'goal_status')
     signals = Signals()
     if case['interrupted'] is not None:

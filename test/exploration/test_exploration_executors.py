@@ -6,34 +6,32 @@ import math
 import multiprocessing.spawn
 import os
 import random
-import re
 import signal
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from threading import Thread
 
 import numpy as np
 import pytest
-from exploration_scenarios import crowded, deadly, follow, loaded, reading
+from exploration_scenarios import crowded, deadly, follow, loaded, nothing, reading, serial
 from hypothesis import strategies as st
 
 from diffdrive_jacobian import signals
 from diffdrive_jacobian.control import find_controller
 from diffdrive_jacobian.exploration.child import call_in_child
-from diffdrive_jacobian.exploration.replay import replay
-from diffdrive_jacobian.exploration.scenario import ExplorationError
-from diffdrive_jacobian.exploration.trial import Outcome
 from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.properties import NeverFasterThan
 from diffdrive_jacobian.simulation import Sweep, SweepSetup, sweep
-from diffdrive_jacobian.testing import LocalExecutor, SerialExecutor, explore, fault_schedules
+from diffdrive_jacobian.testing import LocalExecutor, explore, fault_schedules
 
+pytestmark = pytest.mark.process
 LOSSES = fault_schedules(['speed'], kinds=[Loss], duration=1.2)
-SETUP = SweepSetup(grid=5, starts=3, rate=20.0)
-
-
+FOLLOW = {'scenario': follow, 'properties': [NeverFasterThan(0.35, 1.0)], 'faults': LOSSES}
+SPEEDS = st.fixed_dictionaries({'speed': st.sampled_from([0.0, 1.0, 2.0])})
+SETUP = SweepSetup(grid=3, starts=2, rate=20.0)
 PYTHON = sys.executable
 
 
@@ -43,33 +41,6 @@ def forked_children(monkeypatch, forked_python):
     monkeypatch.setattr(sys, 'executable', str(forked_python))
 
 
-def follow_on(executor):
-    return explore(
-        follow, [NeverFasterThan(0.35, 1.0)], faults=LOSSES, worlds=7, shrink_worlds=6, executor=executor
-    )
-
-
-@pytest.fixture(scope='module')
-def expected():
-    """Explore and sweep in this thread."""
-    return follow_on(SerialExecutor()), sweep(SETUP)
-
-
-def same_results(executor, expected, monkeypatch):
-    """Check that an executor explores and sweeps as this thread does, bit for bit."""
-    # One row of the grid for each task.
-    monkeypatch.setattr(sys.modules[SweepSetup.__module__], 'LOOPS_PER_TASK', 1)
-    found, swept = expected
-    again = follow_on(executor)
-    assert again.findings == found.findings
-    assert again.findings[0].digest
-    assert (again.worlds, again.checks, again.faults) == (found.worlds, found.checks, found.faults)
-    parts = sweep(SETUP, executor=executor)
-    for ours, theirs in zip(swept.outcomes, parts.outcomes, strict=True):
-        assert ours.dtype == theirs.dtype
-        np.testing.assert_array_equal(ours, theirs)
-
-
 @pytest.fixture(scope='module')
 def local():
     """Return the default executor, with one process for all tests."""
@@ -77,21 +48,36 @@ def local():
         yield executor
 
 
-@pytest.mark.parametrize('kind', ['processes', 'local', 'dask'])
-def test_the_same_results_on_another_executor(expected, monkeypatch, local, kind):
-    if kind == 'processes':
-        spawn = multiprocessing.get_context('spawn')
-        with ProcessPoolExecutor(1, mp_context=spawn) as executor:
-            same_results(executor, expected, monkeypatch)
-    elif kind == 'local':
-        same_results(local, expected, monkeypatch)
-    else:
-        distributed = pytest.importorskip('distributed')
-        # On a machine without a network, for which it warns.
-        address = {'host': '127.0.0.1', 'protocol': 'tcp://', 'dashboard_address': None}
-        cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, **address)
-        with cluster, distributed.Client(cluster) as client, client.get_executor() as executor:
-            same_results(executor, expected, monkeypatch)
+@contextmanager
+def processes():
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context('spawn')) as executor:
+        yield executor
+
+
+@contextmanager
+def dask():
+    distributed = pytest.importorskip('distributed')
+    # On a machine without a network, for which it warns.
+    address = {'host': '127.0.0.1', 'protocol': 'tcp://', 'dashboard_address': None}
+    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, **address)
+    with cluster, distributed.Client(cluster) as client, client.get_executor() as executor:
+        yield executor
+
+
+@pytest.mark.parametrize('make', [processes, lambda: LocalExecutor(1), dask])
+def test_an_executor_explores_and_sweeps_as_this_thread_does_bit_for_bit(make, monkeypatch):
+    # One row of the grid for each task.
+    monkeypatch.setattr(sys.modules[SweepSetup.__module__], 'LOOPS_PER_TASK', 1)
+    found, swept = serial(**FOLLOW, worlds=7, shrink_worlds=4), sweep(SETUP)
+    with make() as executor:
+        again = explore(**FOLLOW, worlds=7, shrink_worlds=4, executor=executor)
+        parts = sweep(SETUP, executor=executor)
+    assert again.findings == found.findings
+    assert again.findings[0].digest
+    assert (again.worlds, again.checks, again.faults) == (found.worlds, found.checks, found.faults)
+    for ours, theirs in zip(swept.outcomes, parts.outcomes, strict=True):
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_array_equal(ours, theirs)
 
 
 def use_random_numbers_in_a_thread(_):
@@ -103,29 +89,7 @@ def use_random_numbers_in_a_thread(_):
 
 def test_random_numbers_of_other_threads_do_not_end_the_generation_of_worlds():
     cases = st.integers(0, 5).map(use_random_numbers_in_a_thread)
-    assert explore(follow, cases=cases, worlds=1, executor=SerialExecutor()).worlds == 1
-
-
-class FailsOnce(SerialExecutor):
-    """Fails with the nth of its tasks, and with no other."""
-
-    def __init__(self, number):
-        self.left = number
-
-    def submit(self, fn, /, *args, **kwargs):
-        self.left -= 1
-        return super().submit(fn, *args, **kwargs) if self.left else super().submit(lose_worker)
-
-
-def lose_worker():
-    raise ConnectionError('the worker is gone')
-
-
-@pytest.mark.parametrize('number', [2, 3], ids=['exploring', 'shrinking'])
-def test_an_executor_that_fails_once_is_reported(number):
-    """Also while Hypothesis shrinks, which would try again and call the results unreliable."""
-    with pytest.raises(ExplorationError, match=r'not be run: ConnectionError: the worker is gone$'):
-        follow_on(FailsOnce(number))
+    assert serial(nothing, cases=cases, worlds=1).worlds == 1
 
 
 def test_processes_of_worlds_import_little(monkeypatch):
@@ -135,17 +99,16 @@ def test_processes_of_worlds_import_little(monkeypatch):
     assert not found.findings, str(found)
 
 
-def test_a_process_that_dies_is_a_finding(local, tmp_path, monkeypatch):
-    died = explore(deadly, cases=CASES, worlds=3, executor=local, shrink_worlds=0, output=tmp_path)
+def test_a_process_that_dies_is_a_finding(local, tmp_path):
+    died = explore(deadly, cases=SPEEDS, worlds=3, executor=local, shrink_worlds=0, output=tmp_path)
     (finding,) = died.findings
     assert finding.trial.case == {'speed': 2.0}
     assert finding.count == 1
-    assert re.search('process of the world ended with exit code 3', str(finding))
+    assert 'process of the world ended with exit code 3' in finding.violation.text
     assert 'not recorded: the process of the world ended with exit code 3' in str(finding)
     assert (finding.directory / 'counterexample.json').exists()
-    monkeypatch.setattr(sys.modules[replay.__module__], 'run_world_afresh', lambda _: [Outcome()])
     # Not in this process.
-    assert not died.replay().same_verdict
+    assert died.replay().same_verdict
 
 
 class PressedTwice(LocalExecutor):
@@ -182,7 +145,7 @@ child.call(exec, 'print("busy", flush=True)\\nwhile True: pass')
 def test_a_process_ends_with_a_program_that_is_killed():
     """Also while its world does not end."""
     pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE, 'text': True}
-    with subprocess.Popen([PYTHON, '-c', ENDLESS], **pipes) as program:
+    with subprocess.Popen([sys.executable, '-c', ENDLESS], **pipes) as program:
         pid = int(program.stdout.readline())
         assert program.stderr.readline() == 'busy\n'
         program.kill()
@@ -194,18 +157,11 @@ def test_a_process_ends_with_a_program_that_is_killed():
             raise
 
 
-def test_a_scenario_that_reads_its_input_gets_none(local):
+def test_a_scenario_reads_no_input_and_depends_on_no_earlier_world(local):
     found = explore(reading, worlds=1, executor=local)
     assert not found.findings, str(found)
-
-
-def test_what_depends_on_earlier_worlds_is_not_deterministic(local):
-    found = explore(crowded, cases=CASES, worlds=3, executor=local, shrink_worlds=0)
-    (finding,) = found.findings
-    assert not finding.deterministic
-
-
-CASES = st.fixed_dictionaries({'speed': st.sampled_from([0.0, 1.0, 2.0])})
+    found = explore(crowded, cases=SPEEDS, worlds=3, executor=local, shrink_worlds=0)
+    assert [finding.deterministic for finding in found.findings] == [False]
 
 
 def test_an_exception_in_the_process_of_a_thread_is_raised(local):
@@ -215,17 +171,15 @@ def test_an_exception_in_the_process_of_a_thread_is_raised(local):
 
 
 def test_a_sweep_reports_progress_and_mistakes():
+    def stop(_):
+        raise KeyError('stop')
+
     done = []
     with ThreadPoolExecutor(1) as executor:
-        swept = sweep(SETUP, done.append, executor=executor)
+        assert isinstance(sweep(SETUP, done.append, executor=executor), Sweep)
         assert done == [SETUP.loops]
-        assert isinstance(swept, Sweep)
         own = replace(find_controller('go_to_goal'), name='own', law=lambda *_: None)
         with pytest.raises(ValueError, match="controller 'own' cannot be sent"):
             sweep(replace(SETUP, controller=own), executor=executor)
-
-        def stop(_):
-            raise KeyError('stop')
-
         with pytest.raises(KeyError, match='stop'):
             sweep(SETUP, stop, executor=executor)

@@ -32,15 +32,16 @@ from diffdrive_jacobian.testing import (
     waypoints,
 )
 
-FEW = settings(max_examples=40, database=None, derandomize=True)
+FEW = settings(max_examples=40, database=None, derandomize=True, deadline=None)
 SHRINK = settings(max_examples=100, database=None, derandomize=True)
-
-
 FIELDS = {'odom': ['pose.pose.position.x', 'header.stamp', 'header.frame_id']}
 
 
 def on_grid(value, step=0.1):
     return value == round(round(value / step) * step, 10)
+
+
+# --- Values
 
 
 @FEW
@@ -57,9 +58,8 @@ def test_values_are_on_their_grids(number, time, pose, goal, route, gain, probab
     assert on_grid(probability, 0.05)
 
 
-@pytest.mark.parametrize(
-    ('strategy', 'condition', 'smallest'),
-    [
+def test_values_shrink_to_round_ones():
+    for strategy, condition, smallest in (
         (numbers(-5.0, 5.0), lambda x: True, 0.0),
         (numbers(-5.0, 5.0), lambda x: x > 2.6, 3.0),
         (numbers(-5.0, 5.0), lambda x: x < -2.6, -3.0),
@@ -72,10 +72,35 @@ def test_values_are_on_their_grids(number, time, pose, goal, route, gain, probab
         (gains(), lambda k: k > 2.2, 5.0),
         (probabilities(), lambda p: p < 0.5, 0.05),
         (goals(), lambda goal: True, (1.0, 0.0, 0.0)),
+    ):
+        assert find(strategy, condition, settings=SHRINK) == smallest
+
+
+@pytest.mark.parametrize(
+    ('make', 'words'),
+    [
+        (lambda: numbers(1.0, 0.0), 'low <= high'),
+        (lambda: numbers(0.0, math.nan), 'finite'),
+        (lambda: numbers(0.01, 0.02), 'no number with 1 decimals'),
+        (lambda: numbers(0.0, 1.0, decimals=7), 'decimals'),
+        (lambda: gains(0.0, 1.0), 'positive'),
+        (lambda: gains(0.011, 0.012), 'no gain'),
+        (lambda: fault_schedules(), 'needs topics, nodes'),
+        (lambda: fault_schedules(fields={'odom': 'x'}), 'odom must be a list or tuple of names'),
+        (lambda: fault_schedules(fields=['odom']), r"fields must be a dict .* got \['odom'\]"),
+        (lambda: fault_schedules('odom'), 'topics must be a list or tuple of names, got .odom'),
+        (lambda: fault_schedules(['odom'], max_faults=0), 'max_faults'),
+        (lambda: fault_schedules(['odom'], duration=math.inf), 'duration'),
+        (lambda: fault_schedules(kinds=[faults.Loss]), 'Loss needs topics'),
+        (lambda: fault_schedules(kinds=[int]), 'kinds must be among Loss, .* got int'),
     ],
 )
-def test_values_shrink_to_round_ones(strategy, condition, smallest):
-    assert find(strategy, condition, settings=SHRINK) == smallest
+def test_mistakes_are_named(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+# --- Schedules of faults
 
 
 def lost(schedule, seconds, at):
@@ -98,33 +123,17 @@ def test_a_schedule_shrinks_to_one_round_fault():
 
 
 @FEW
-@given(fault_schedules(['odom'], ['robot'], services=['reset'], max_faults=4, duration=3.0))
-def test_faults_have_ended_in_time(schedule):
+@given(
+    fault_schedules(['odom'], ['robot'], services=['reset'], max_faults=4, duration=3.0),
+    fault_schedules(fields=FIELDS, robots=['virtual_robot'], duration=3.0),
+)
+def test_faults_are_of_their_kinds_and_have_ended_in_time(schedule, others):
     assert len(schedule) <= 4
     for fault in schedule:
         assert fault.start + fault.duration <= 3.0 + 1e-9
         assert on_grid(fault.start)
         assert on_grid(fault.duration)
-
-
-@pytest.mark.parametrize('kind', [faults.TimeJump])
-def test_only_the_kinds_that_are_asked_for(kind):
-    strategy = fault_schedules(['odom'], ['robot'], kinds=[kind], max_faults=1)
-    assert type(find(strategy, bool, settings=SHRINK)[0]) is kind
-
-
-def test_kinds_may_be_strategies_of_ones_own_and_endless():
-    own = st.just(faults.ParameterChange('robot', 'kp', 2.0))
-    assert find(fault_schedules(kinds=[own]), bool, settings=SHRINK) == [own.value]
-    endless = fault_schedules(['odom'], kinds=[faults.Stale], endless=True)
-    found = find(endless, lambda s: any(math.isinf(one.duration) for one in s), settings=SHRINK)
-    assert found == [faults.Stale('odom')]
-
-
-@FEW
-@given(fault_schedules(fields=FIELDS, robots=['virtual_robot'], duration=3.0))
-def test_corruption_and_faults_of_the_robot(schedule):
-    for fault in schedule:
+    for fault in others:
         if isinstance(fault, faults.Corrupt):
             assert fault.field in FIELDS[fault.topic]
             if fault.field == 'header.stamp':
@@ -134,39 +143,14 @@ def test_corruption_and_faults_of_the_robot(schedule):
             assert isinstance(fault, faults.RobotFault)
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        ({}, 'needs topics, nodes'),
-        ({'fields': {'odom': 'x'}}, "odom must be a list or tuple of names, got 'x'"),
-        ({'fields': ['odom']}, r"fields must be a dict .* got \['odom'\]"),
-        ({'topics': 'odom'}, 'topics must be a list or tuple of names, got .odom'),
-        ({'topics': ['odom'], 'max_faults': 0}, 'max_faults'),
-        ({'topics': ['odom'], 'duration': math.inf}, 'duration'),
-        ({'kinds': [faults.Loss]}, 'Loss needs topics'),
-        ({'kinds': [int]}, 'kinds must be among Loss, .* got int'),
-    ],
-)
-def test_mistakes_in_schedules_are_named(arguments, words):
-    with pytest.raises(ValueError, match=words):
-        fault_schedules(**arguments)
-
-
-@pytest.mark.parametrize(
-    ('function', 'arguments', 'words'),
-    [
-        (numbers, (1.0, 0.0), 'low <= high'),
-        (numbers, (0.0, math.nan), 'finite'),
-        (numbers, (0.01, 0.02), 'no number with 1 decimals'),
-        (numbers, (0.0, 1.0), 'decimals'),
-        (gains, (0.0, 1.0), 'positive'),
-        (gains, (0.011, 0.012), 'no gain'),
-    ],
-)
-def test_mistakes_in_ranges_are_named(function, arguments, words):
-    more = {'decimals': 7} if words == 'decimals' else {}
-    with pytest.raises(ValueError, match=words):
-        function(*arguments, **more)
+def test_kinds_are_those_that_are_asked_for_also_of_ones_own_and_endless():
+    jumps = fault_schedules(['odom'], ['robot'], kinds=[faults.TimeJump], max_faults=1)
+    assert type(find(jumps, bool, settings=SHRINK)[0]) is faults.TimeJump
+    own = st.just(faults.ParameterChange('robot', 'kp', 2.0))
+    assert find(fault_schedules(kinds=[own]), bool, settings=SHRINK) == [own.value]
+    endless = fault_schedules(['odom'], kinds=[faults.Stale], endless=True)
+    found = find(endless, lambda s: any(math.isinf(one.duration) for one in s), settings=SHRINK)
+    assert found == [faults.Stale('odom')]
 
 
 # --- Generation
@@ -224,33 +208,19 @@ class Place:
     side: Side = Side.LEFT
 
 
-@pytest.mark.parametrize(
-    'value',
-    [
-        None,
-        [1, -2.5, True, 'a"b', b'\0'],
-        {'a': (1.0,), 'b': ()},
-        {1, 2},
-        frozenset(),
-        set(),
-        math.inf,
-        Place(1.0),
-        [Place(-math.inf, Side.LEFT)],
+def test_source_evaluates_to_the_value():
+    for value in (
+        *(None, [1, -2.5, True, 'a"b', b'\0'], {'a': (1.0,), 'b': ()}),
+        *({1, 2}, frozenset(), set(), math.inf, Place(1.0), [Place(-math.inf, Side.LEFT)]),
         faults.Loss('odom', probability=0.5, start=1.0),
-    ],
-)
-def test_source_evaluates_to_the_value(value):
-    source = Source()
-    text = source.expression(value)
-    names = {name: getattr(importlib.import_module(module), name) for module, name in source.imports}
-    assert eval(text, names) == value
-
-
-def test_source_of_nan_and_of_defaults():
-    assert Source().expression(math.nan) == "float('nan')"
-    source = Source()
-    assert source.expression(faults.Loss('odom', start=2.0)) == "Loss('odom', start=2.0)"
+    ):
+        source = Source()
+        text = source.expression(value)
+        names = {name: getattr(importlib.import_module(module), name) for module, name in source.imports}
+        assert eval(text, names) == value
+    assert text == "Loss('odom', probability=0.5, start=1.0)"
     assert source.imports == {('diffdrive_jacobian.faults', 'Loss')}
+    assert Source().expression(math.nan) == "float('nan')"
     with pytest.raises(ExplorationError, match=r'a case must consist of .* got object'):
         Source().expression([object()])
 

@@ -1,4 +1,4 @@
-"""Our nodes in 300 explored worlds; `explore_nodes.py` runs more."""
+"""Our nodes in a few explored worlds; `promises.py run explored` tries thousands."""
 
 from __future__ import annotations
 
@@ -9,40 +9,39 @@ from diffdrive_jacobian import faults
 from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.testing import Lockstep, SerialExecutor, explore
 
+pytestmark = [pytest.mark.slow, pytest.mark.parametrize('name', SCENARIOS)]
+WORLDS = 8
 
-@pytest.mark.parametrize('seed', range(3))
-@pytest.mark.parametrize('name', SCENARIOS)
-def test_nothing_is_found_in_our_nodes(name, seed, tmp_path):
+
+def test_nothing_is_found_in_our_nodes(name, tmp_path):
     scenario, cases, schedules = SCENARIOS[name]
     result = explore(
         scenario,
         properties(),
         cases=cases,
         faults=schedules,
-        worlds=50,
-        seed=seed,
+        worlds=WORLDS,
         executor=SerialExecutor(),
         output=tmp_path,
     )
     assert not result.findings, f'{result}\nsee {tmp_path}'
-    assert result.worlds == 50
-    assert result.faults > 10
+    assert result.worlds == WORLDS
+    assert result.faults > 0
 
 
-@pytest.mark.parametrize('name', SCENARIOS)
 def test_a_world_is_the_same_each_time(name):
     scenario = SCENARIOS[name][0]
     case = {
         'start': (0.0, 0.0, 0.0),
         'script': [(0.0, 'goal', (0.5, 0.1, 0.0)), (1.0, 'waypoints', [(0.2, 0.0, 0.0)])],
         'goal': (0.3, 0.0, 0.0),
-        'timeout': 10.0,
-        'interrupted': 2.0,
+        'timeout': 3.0,
+        'interrupted': 1.0,
     }
     digests = set()
     for _ in range(2):
         with Lockstep() as world, MessageDigest(world) as messages:
-            world.inject(faults.Loss('odom', probability=0.5, duration=2.0), seed=1)
+            world.inject(faults.Loss('odom', probability=0.5, duration=1.0), seed=1)
             scenario(world, case)
             digests.add(messages.value())
     assert len(digests) == 1

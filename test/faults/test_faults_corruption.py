@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 import math
-import pickle
+import operator
 import random
-import sys
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterValue
@@ -20,7 +19,7 @@ from std_msgs.msg import Bool, Byte, Empty, Int8, Int64, String, UInt8
 from support.lockstep_nodes import QUICK, Topics, add_team, arrives
 from support.ros_messages import goal, odometry, time_of
 
-from diffdrive_jacobian.faults.corruption import CHANGES, Corrupt
+from diffdrive_jacobian.faults.corruption import Corrupt
 
 SECOND = 1_000_000_000
 
@@ -54,42 +53,48 @@ def refused(message_type, *args, **kwargs):
 
 # --- Values
 
+Y = 'pose.pose.position.y'
+CHANGED = [
+    (Y, 'nan', None, math.nan),
+    (Y, 'inf', None, math.inf),
+    (Y, '-inf', None, -math.inf),
+    (Y, 'negate', None, 2.0),
+    (Y, 'offset', 0.25, -1.75),
+    (Y, 'offset', -3, -5.0),
+    (Y, 'scale', -10.0, 20.0),
+    (Y, 'scale', 1.7e308, -math.inf),
+    (Y, 'set', 7, 7.0),
+    (Y, 'subnormal', None, -5e-324),
+    ('header.frame_id', 'set', 'a frame that is longer', 'a frame that is longer'),
+    # A stamp is shifted in seconds, within what it can represent.
+    ('header.stamp', 'offset', -2.5, Time(sec=9, nanosec=750_000_000)),
+    ('header.stamp', 'offset', 0.75, Time(sec=13)),
+    ('header.stamp', 'offset', -20.0, Time(sec=-8, nanosec=250_000_000)),
+    ('header.stamp', 'offset', 1e300, Time(sec=2**31 - 1, nanosec=SECOND - 1)),
+    ('header.stamp', 'offset', -1e300, Time(sec=-(2**31))),
+    ('header.stamp', 'set', 0.0, Time()),
+    ('header.stamp', 'set', -0.5, Time(sec=-1, nanosec=500_000_000)),
+    # One that makes no sense is possible, too.
+    ('header.stamp.sec', 'set', -3, -3),
+    ('header.stamp.nanosec', 'set', 2**32 - 1, 2**32 - 1),
+]
 
-@pytest.mark.parametrize(
-    ('change', 'amount', 'expected'),
-    [
-        ('nan', 0.0, math.nan),
-        ('inf', 0.0, math.inf),
-        ('-inf', 0.0, -math.inf),
-        ('negate', 0.0, 2.0),
-        ('offset', 0.25, -1.75),
-        ('offset', -3, -5.0),
-        ('scale', -10.0, 20.0),
-        ('scale', 1.7e308, -math.inf),
-        ('set', 7, 7.0),
-        ('subnormal', 0.0, -5e-324),
-    ],
-)
-def test_one_float_is_changed_and_nothing_else(change, amount, expected):
+
+@pytest.mark.parametrize(('path', 'change', 'amount', 'expected'), CHANGED)
+def test_one_field_is_changed_and_nothing_else(path, change, amount, expected):
     sent = drive()
-    received = corrupted(sent, 'pose.pose.position.y', change, amount)
-    np.testing.assert_equal(received.pose.pose.position.y, expected)
-    received.pose.pose.position.y = sent.pose.pose.position.y
+    received = corrupted(sent, path, change, *(() if amount is None else (amount,)))
+    np.testing.assert_equal(operator.attrgetter(path)(received), expected)
+    place, _, name = path.rpartition('.')
+    setattr(operator.attrgetter(place)(received), name, operator.attrgetter(path)(sent))
     assert received == sent
 
 
 def test_a_float_of_single_precision_gets_its_own_subnormal_and_overflows_at_its_own_limit():
     sent = BatteryState(voltage=12.0, temperature=-1.0)
-    tiny = corrupted(sent, 'temperature', 'subnormal').temperature
-    assert tiny == -(2.0**-149)
-    assert abs(tiny) < float(np.finfo(np.float32).smallest_normal)
+    assert corrupted(sent, 'temperature', 'subnormal').temperature == -(2.0**-149)
     assert corrupted(sent, 'voltage', 'scale', 1e300).voltage == math.inf
     assert corrupted(sent, 'voltage', 'set', 0.1).voltage == float(np.float32(0.1))
-
-
-def test_a_double_subnormal_is_below_the_least_normal_number():
-    value = corrupted(drive(), 'pose.pose.position.x', 'subnormal').pose.pose.position.x
-    assert 0.0 < value < sys.float_info.min
 
 
 @pytest.mark.parametrize(
@@ -112,40 +117,6 @@ def test_other_types_stay_within_their_range(message, change, amount, expected):
     received = corrupted(message, 'data', change, amount)
     assert received.data == expected
     assert type(received.data) is type(expected)
-
-
-def test_a_wrong_frame():
-    sent = drive()
-    received = corrupted(sent, 'header.frame_id', 'set', 'a frame that is longer')
-    assert received.header.frame_id == 'a frame that is longer'
-    received.header.frame_id = sent.header.frame_id
-    assert received == sent
-
-
-@pytest.mark.parametrize(
-    ('change', 'amount', 'expected'),
-    [
-        ('offset', -2.5, (9, 750_000_000)),
-        ('offset', 0.75, (13, 0)),
-        ('offset', -20.0, (-8, 250_000_000)),
-        ('offset', 1e300, (2**31 - 1, SECOND - 1)),
-        ('offset', -1e300, (-(2**31), 0)),
-        ('set', 0.0, (0, 0)),
-        ('set', -0.5, (-1, 500_000_000)),
-    ],
-)
-def test_a_stamp_is_shifted_in_seconds_within_what_it_can_represent(change, amount, expected):
-    stamp = corrupted(drive(), 'header.stamp', change, amount).header.stamp
-    assert (stamp.sec, stamp.nanosec) == expected
-
-
-@pytest.mark.parametrize(
-    ('part', 'amount', 'expected'),
-    [('sec', -3, (-3, 250_000_000)), ('nanosec', 2**32 - 1, (12, 2**32 - 1))],
-)
-def test_stamps_that_make_no_sense_are_possible(part, amount, expected):
-    stamp = corrupted(drive(), f'header.stamp.{part}', 'set', amount).header.stamp
-    assert (stamp.sec, stamp.nanosec) == expected
 
 
 # --- Paths
@@ -282,39 +253,6 @@ def test_a_change_that_the_type_does_not_allow_is_refused_with_those_that_it_doe
 
 def test_a_type_without_fields():
     assert "has no 'data'" in refused(Empty, 'data', 'nan')
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'told'),
-    [
-        ({'change': 'broken'}, "change must be one of 'nan', 'inf'"),
-        (
-            {'change': 'offset', 'amount': math.nan},
-            "amount of 'offset' must be a finite number, got nan",
-        ),
-        ({'change': 'scale', 'amount': 'x'}, "amount of 'scale' must be a finite number, got 'x'"),
-        ({'change': 'offset', 'amount': True}, 'must be a finite number, got True'),
-        ({'change': 'set', 'amount': math.inf}, "a bool or a str (for others there are 'nan', 'inf'"),
-        ({'change': 'set', 'amount': None}, 'a bool or a str'),
-        ({'change': 'nan', 'amount': 2.0}, "amount must not be given with change 'nan', got 2.0"),
-        ({'change': 'nan', 'probability': 1.5}, 'probability must be in [0, 1], got 1.5'),
-        ({'change': 'nan', 'field': ''}, 'field must be a string'),
-        ({'change': 'nan', 'topic': 3}, 'topic must be a string'),
-        ({'change': 'nan', 'start': -1.0}, 'start must be'),
-    ],
-)
-def test_invalid_values_are_refused_at_once(arguments, told):
-    with pytest.raises(ValueError, match=r'^Corrupt: ') as caught:
-        Corrupt(**{'topic': 'odom', 'field': 'pose', **arguments})
-    assert told in str(caught.value)
-
-
-@pytest.mark.parametrize('change', CHANGES)
-def test_a_corruption_is_a_value_and_its_repr_makes_it_again(change):
-    amount = {'offset': np.float64(0.5), 'scale': 2, 'set': 'map'}.get(change, 0.0)
-    fault = Corrupt('odom', 'header.frame_id', change, amount, probability=0.5, start=2.0, node='robot')
-    assert eval(repr(fault)) == fault == pickle.loads(pickle.dumps(fault)) == copy.deepcopy(fault)
-    assert fault != Corrupt('odom', 'header.frame_id', change, amount)
 
 
 # --- In a world

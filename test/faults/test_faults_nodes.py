@@ -93,42 +93,25 @@ def test_a_node_without_a_factory_cannot_be_made_again(lockstep):
         lockstep.run_for(1.0)
 
 
-def test_tasks_of_a_killed_node_end(lockstep):
-    done = []
-
-    class Waiter(Node):
-        def __init__(self):
-            super().__init__('waiter')
-            self.client = self.create_client(Trigger, 'ask')
-            self.create_subscription(Int64, 'count', self.on_message, 10)
-
-        async def on_message(self, message):
-            done.append(message.data)
-            await self.client.call_async(Trigger.Request())
-            done.append('answered')
-
-    lockstep.create(Relay)
-    lockstep.create(Waiter)
-    lockstep.inject(faults.LateService('ask', 0.5), faults.Kill('waiter', start=0.2))
-    lockstep.publish('count', Int64(data=5))
-    lockstep.run_for(1.0)
-    assert done == [5]
-
-
-def test_tasks_of_a_removed_node_end(lockstep):
-    done = []
+@pytest.mark.parametrize('killed', [True, False])
+def test_tasks_of_a_killed_or_removed_node_end(lockstep, killed):
+    done, gate = [], Future()
 
     class Waiter(Node):
         async def wait(self):
             done.append('waiting')
-            await Future()
+            await gate
             done.append('never')
 
-    waiter = lockstep.add(Waiter('waiter'))
+    waiter = lockstep.create(lambda: Waiter('waiter'))
     waiter.executor.create_task(waiter.wait)
+    if killed:
+        lockstep.inject(faults.Kill('waiter', start=0.1))
     lockstep.inject(faults.Hang('waiter', duration=0.1))
     lockstep.run_for(0.2)
-    lockstep.remove(waiter)
+    if not killed:
+        lockstep.remove(waiter)
+    gate.set_result(None)
     lockstep.run_for(0.2)
     assert done == ['waiting']
 
@@ -136,17 +119,49 @@ def test_tasks_of_a_removed_node_end(lockstep):
 # --- Frozen
 
 
-def test_a_frozen_node_continues_with_what_waits(lockstep, relay):
-    lockstep.inject(faults.Hang('relay', start=0.25, duration=0.3))
-    lockstep.run_for(1.0)
-    assert relay.received == [
-        *[(1, 100.0), (2, 200.0)],
-        *[(3, 550.0), (4, 550.0), (5, 550.0)],
-        *[(number, 100.0 * number) for number in range(6, 11)],
-    ]
-    assert relay.ticks == [100.0, 200.0, 550.0, 600.0, 700.0, 800.0, 900.0, 1000.0]
-    assert relay.sink.received == relay.received
-    assert '3 messages and requests wait' in whats(lockstep)
+def in_time(first, last):
+    return [(number, 100.0 * number) for number in range(first, last + 1)]
+
+
+def at(time, *numbers):
+    return [(number, time) for number in numbers]
+
+
+HELD = {
+    'frozen': (
+        [faults.Hang('relay', start=0.25, duration=0.3)],
+        [*in_time(1, 2), *at(550.0, 3, 4, 5), *in_time(6, 9)],
+        [100.0, 200.0, 550.0, 600.0, 700.0, 800.0, 900.0],
+    ),
+    'frozen twice': (
+        [
+            faults.Hang('relay', start=0.15, duration=0.3),
+            faults.Hang('relay', start=0.3, duration=0.45),
+        ],
+        [*in_time(1, 1), *at(750.0, 2, 3, 4, 5, 6, 7), *in_time(8, 9)],
+        [100.0, 750.0, 800.0, 900.0],
+    ),
+    'frozen while messages are delayed': (
+        [
+            faults.Delay('count', 0.25, node='relay', duration=0.15),
+            faults.Hang('relay', start=0.3, duration=0.25),
+        ],
+        [*at(550.0, 1, 2, 3, 4, 5), *in_time(6, 9)],
+        [100.0, 200.0, 550.0, 600.0, 700.0, 800.0, 900.0],
+    ),
+}
+
+
+@pytest.mark.parametrize('how', HELD)
+def test_a_node_that_is_held_continues_with_what_waits(lockstep, relay, how):
+    injected, received, ticks = HELD[how]
+    lockstep.inject(*injected)
+    lockstep.run_for(0.9)
+    assert relay.received == received
+    assert relay.ticks == ticks
+    if how == 'frozen':
+        assert relay.sink.received == received
+        assert '3 messages and requests wait' in whats(lockstep)
 
 
 def test_the_queues_of_a_frozen_node_lose_the_oldest(lockstep):
@@ -186,23 +201,6 @@ def test_a_frozen_node_receives_responses_and_continues_its_tasks_late(lockstep)
     assert order == [('done', 0.5), ('answered', 0.5)]
 
 
-def test_two_holds_of_a_node_add_up(lockstep, relay):
-    lockstep.inject(
-        faults.Hang('relay', start=0.15, duration=0.3), faults.Hang('relay', start=0.3, duration=0.45)
-    )
-    lockstep.run_for(0.9)
-    assert relay.received[2:] == [*((number, 750.0) for number in range(3, 8)), (8, 800.0), (9, 900.0)]
-
-
-def test_a_delayed_message_waits_in_the_queue_of_a_frozen_node(lockstep, relay):
-    lockstep.inject(
-        faults.Delay('count', 0.25, node='relay', duration=0.15),
-        faults.Hang('relay', start=0.3, duration=0.25),
-    )
-    lockstep.run_for(0.6)
-    assert relay.received == [*((number, 550.0) for number in range(1, 6)), (6, 600.0)]
-
-
 def test_a_node_with_an_action_cannot_be_frozen():
     """No package with actions is installed here."""
     node = SimpleNamespace(waitables=[object()], get_fully_qualified_name=lambda: '/node')
@@ -230,21 +228,29 @@ def test_what_a_slow_node_publishes_leaves_late_and_what_arrives_waits(lockstep,
     ]
 
 
-def test_a_slow_node_does_what_has_waited_longest(lockstep, relay):
+@pytest.mark.parametrize(
+    ('seconds', 'received', 'ticks'),
+    [
+        (0.06, [(1, 100.0), (2, 220.0), (3, 340.0), (4, 460.0)], [160.0, 280.0, 400.0]),
+        (0.25, [(1, 100.0)], [350.0]),
+    ],
+)
+def test_a_slow_node_does_what_has_waited_longest(lockstep, relay, seconds, received, ticks):
     """Messages and ticks are due together. The message comes first, the tick is older than the next."""
-    lockstep.inject(faults.Slow('relay', 0.06))
+    lockstep.inject(faults.Slow('relay', seconds))
     lockstep.run_for(0.5)
-    assert relay.received == [(1, 100.0), (2, 220.0), (3, 340.0), (4, 460.0)]
-    assert relay.ticks == [160.0, 280.0, 400.0]
+    assert relay.received == received
+    assert relay.ticks == ticks
 
 
 def test_a_slow_node_loses_messages_from_a_full_queue(lockstep):
     relay = lockstep.create(lambda: Relay(profile=1, period=99.0))
     lockstep.create(Source)
     relay.received.clear()
-    lockstep.inject(faults.Slow('relay', 0.25, start=0.05))
+    lockstep.inject(faults.Slow('relay', 0.25, start=0.05, duration=0.95))
     lockstep.run_for(1.0)
     assert relay.received == [(1, 100.0), (3, 350.0), (5, 600.0), (8, 850.0)]
+    assert 'lost from full queues: ' in whats(lockstep)[-2]
 
 
 def test_a_slow_service_responds_late_and_serves_one_after_the_other(lockstep):
@@ -285,26 +291,35 @@ def test_a_tick_later_than_a_period_replaces_those_between(lockstep, relay):
 # --- Parameters
 
 
-def test_a_parameter_is_changed_and_changed_back(lockstep, relay):
+@pytest.fixture
+def gains(lockstep, relay):
+    """The values of a parameter of the relay, every 100 ms."""
     values = []
     lockstep.node.create_timer(0.1, lambda: values.append(relay.get_parameter('gain').value))
-    lockstep.inject(faults.ParameterChange('relay', 'gain', 3.0, start=0.15, duration=0.2))
+    return values
+
+
+def changing(value, start, duration):
+    return faults.ParameterChange('relay', 'gain', value, start=start, duration=duration)
+
+
+def test_a_parameter_is_changed_and_changed_back(lockstep, gains):
+    lockstep.inject(changing(3.0, 0.15, 0.2))
     lockstep.run_for(0.5)
-    assert values == [1.0, 3.0, 3.0, 1.0, 1.0]
+    assert gains == [1.0, 3.0, 3.0, 1.0, 1.0]
     assert whats(lockstep) == ['begins', 'gain is 3.0, was 1.0', 'gain is 1.0, was 3.0', 'ends']
+    lockstep.inject(faults.ParameterChange('other', 'gain', 3.0, start=0.6))
+    lockstep.run_for(0.2)
+    assert whats(lockstep)[4:] == ['begins', 'the node is not there']
+    lockstep.add(Node('other', parameter_overrides=[]))
+    lockstep.check_faults()
 
 
-def test_changes_of_a_parameter_that_overlap_end_with_the_first_value(lockstep, relay):
-    values = []
-    lockstep.node.create_timer(0.1, lambda: values.append(relay.get_parameter('gain').value))
-    lockstep.inject(
-        faults.ParameterChange('relay', 'gain', 3.0, start=0.05, duration=0.2),
-        faults.ParameterChange('relay', 'gain', 5.0, start=0.15, duration=0.2),
-        faults.ParameterChange('relay', 'gain', 7.0, start=0.45, duration=0.3),
-        faults.ParameterChange('relay', 'gain', 9.0, start=0.55, duration=0.1),
-    )
+def test_changes_of_a_parameter_that_overlap_end_with_the_first_value(lockstep, gains):
+    lockstep.inject(changing(3.0, 0.05, 0.2), changing(5.0, 0.15, 0.2))
+    lockstep.inject(changing(7.0, 0.45, 0.3), changing(9.0, 0.55, 0.1))
     lockstep.run_for(0.8)
-    assert values == [3.0, 5.0, 5.0, 1.0, 7.0, 9.0, 7.0, 1.0]
+    assert gains == [3.0, 5.0, 5.0, 1.0, 7.0, 9.0, 7.0, 1.0]
 
 
 def test_a_parameter_of_a_frozen_node_is_changed_back(lockstep, relay):
@@ -334,11 +349,6 @@ def test_node_faults_that_met_no_node_are_errors(lockstep):
     for name in ('/a', '/b', '/c/d', '/e'):
         assert f'no node {name} was seen' in str(caught.value)
     lockstep.close()
-
-
-def test_faults_of_the_node_of_the_test_are_refused(lockstep):
-    with pytest.raises(LockstepError, match=r"Kill\('lockstep'\) names the node of the test itself"):
-        lockstep.inject(faults.Kill('lockstep'))
 
 
 def test_what_waits_behind_an_exception_is_processed_later(lockstep):

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
-from dataclasses import FrozenInstanceError, dataclass, fields
+import re
+from dataclasses import FrozenInstanceError, dataclass, fields, replace
+from inspect import isabstract
 
+import numpy as np
 import pytest
 from faults_nodes import Relay, Sink, Source, whats
 from std_msgs.msg import Int64
@@ -165,76 +169,100 @@ def test_a_fault_of_a_publisher_is_seen_by_everybody(lockstep):
 
 # --- As values
 
-ALL = [
-    faults.Loss('odom', probability=0.5, start=2, duration=1),
-    faults.Loss('odom', 0.5, 3, node='go_to_goal'),
-    faults.Delay('odom', 0.2, spread=0.1, growth=0.01),
-    faults.Reorder('odom', 0.5, 0.1),
-    faults.Duplicate('odom'),
-    faults.RateLimit('odom', 10),
-    faults.Stale('odom', start=1.5),
-    faults.Kill('virtual_robot', start=1.0, duration=2.0),
-    faults.Hang('virtual_robot'),
-    faults.Slow('virtual_robot', 0.01),
-    faults.TimerJitter('virtual_robot', 0.005),
-    faults.TimeJump(-5.0),
-    faults.ClockPause(duration=2.0),
-    faults.LateService('reset', INF),
-    faults.ParameterChange('go_to_goal', 'kp', 2.0),
-    faults.ParameterChange('go_to_goal', 'names', ['a']),
+EXPRESSIONS = [
+    "Loss('odom', probability=0.5, start=2.0, duration=1.0)",
+    "Loss('odom', probability=0.5, burst=3, node='go_to_goal')",
+    "Delay('odom', 0.2, spread=0.1, growth=0.01)",
+    "Reorder('odom', 0.5, 0.1)",
+    "Duplicate('odom')",
+    "RateLimit('odom', 10.0)",
+    "Stale('odom', start=1.5)",
+    "Kill('virtual_robot', start=1.0, duration=2.0)",
+    "Hang('virtual_robot')",
+    "Slow('virtual_robot', 0.01)",
+    "TimerJitter('virtual_robot', 0.005)",
+    'TimeJump(-5.0)',
+    'ClockPause(duration=2.0)',
+    "LateService('reset', float('inf'))",
+    "ParameterChange('go_to_goal', 'kp', 2.0)",
+    "ParameterChange('go_to_goal', 'names', ('a',))",
+    "Corrupt('odom', 'header.frame_id', 'nan', probability=0.5, start=2.0, node='robot')",
+    "Corrupt('odom', 'header.frame_id', 'set', amount='map')",
+    "Corrupt('odom', 'header.frame_id', 'scale', amount=2)",
+    "DeadWheel('left', start=1.0)",
+    "SaturatedWheel('right', 2.0, robot='/one/virtual_robot')",
+    'ActuatorLag(0.1, duration=2.0)',
+    'EncoderSteps(16)',
+    'Slip()',
+    'WrongGeometry(left_wheel_radius_multiplier=0.5)',
+    'Push(dx=0.1, dtheta=-0.5, noticed=True)',
 ]
 
 
-@pytest.mark.parametrize('fault', ALL, ids=repr)
-def test_faults_are_values(fault):
-    same = eval(repr(fault), vars(faults))
-    assert same == fault == pickle.loads(pickle.dumps(fault))
-    assert hash(same) == hash(fault)
-    assert repr(same) == repr(fault)
-    assert fault.__doc__
-    for one in fields(fault):
-        with pytest.raises(FrozenInstanceError):
-            setattr(fault, one.name, 1)
+def test_faults_are_values_whose_short_expressions_make_them_again():
+    kinds = set()
+    for expression in EXPRESSIONS:
+        fault = eval(expression, vars(faults))
+        kinds.add(type(fault))
+        assert repr(fault) == expression
+        assert fault == pickle.loads(pickle.dumps(fault)) == copy.deepcopy(fault)
+        assert hash(fault) == hash(eval(expression, vars(faults)))
+        assert fault.start == 9.0 or fault != replace(fault, start=9.0)
+        assert fault.__doc__
+        for one in fields(fault):
+            with pytest.raises(FrozenInstanceError):
+                setattr(fault, one.name, 1)
+    # Numbers of NumPy become those of Python.
+    number = faults.Corrupt('odom', 'x', 'offset', np.float64(0.5))
+    assert repr(number) == "Corrupt('odom', 'x', 'offset', amount=0.5)"
+    public = {kind for kind in vars(faults).values() if isinstance(kind, type)}
+    assert kinds == {kind for kind in public if issubclass(kind, faults.Fault) and not isabstract(kind)}
 
 
-def test_the_expression_of_a_fault_is_short():
-    assert repr(ALL[0]) == "Loss('odom', probability=0.5, start=2.0, duration=1.0)"
-    assert repr(ALL[13]) == "LateService('reset', float('inf'))"
-    assert repr(ALL[15]) == "ParameterChange('go_to_goal', 'names', ('a',))"
+INVALID = [
+    (lambda: faults.Loss(''), "topic must be a string that is not empty, got ''"),
+    (lambda: faults.Loss('a', node=3), 'node must be a string, got 3'),
+    (lambda: faults.Loss('a', probability=1.5), 'probability must be in [0, 1], got 1.5'),
+    (lambda: faults.Loss('a', probability='x'), "probability must be a number, got 'x'"),
+    (lambda: faults.Loss('a', burst=0), 'burst must be an integer of at least 1, got 0'),
+    (lambda: faults.Loss('a', burst=True), 'burst must be an integer of at least 1, got True'),
+    (lambda: faults.Loss('a', start=-1), 'start must be zero or positive and finite, got -1'),
+    (lambda: faults.Loss('a', start=INF), 'start must be zero or positive and finite, got inf'),
+    (lambda: faults.Loss('a', duration=0.0), 'duration must be positive, got 0'),
+    (lambda: faults.Delay('a', float('nan')), 'must be zero or positive and finite, got nan'),
+    (lambda: faults.Reorder('a', 0.5, 0.0), 'seconds must be positive and finite, got 0.0'),
+    (lambda: faults.Duplicate('a', copies=1.5), 'copies must be an integer of at least 1, got 1.5'),
+    (lambda: faults.RateLimit('a', 0), 'rate must be positive and finite, got 0'),
+    (lambda: faults.Slow('a', -1.0), 'seconds must be positive and finite, got -1.0'),
+    (lambda: faults.TimeJump(0.0), 'seconds must not be zero, got 0.0'),
+    (lambda: faults.TimeJump(INF), 'seconds must be finite, got inf'),
+    (lambda: faults.LateService('a', 0.0), 'seconds must be positive, got 0.0'),
+    (lambda: faults.ParameterChange('a', 'b', None), 'value must be a bool, int, float, str, or a'),
+    (lambda: faults.ParameterChange('a', 'b', [1, 'x']), "got [1, 'x']"),
+    (lambda: faults.DeadWheel('front'), "wheel must be one of 'left', 'right', got 'front'"),
+    (lambda: faults.SaturatedWheel('left', 0.0), 'max_velocity must be positive and finite, got 0.0'),
+    (lambda: faults.ActuatorLag(-1.0), 'seconds must be positive and finite, got -1.0'),
+    (lambda: faults.EncoderSteps(0), 'per_revolution must be an integer from 1 to 1000000000, got 0'),
+    (lambda: faults.EncoderSteps(1.5), 'per_revolution must be an integer from 1 to'),
+    (lambda: faults.EncoderSteps(10**10), 'from 1 to 1000000000, got 10000000000'),
+    (lambda: faults.Push(float('nan')), 'dx must be finite, got nan'),
+    (lambda: faults.Push(noticed=1), 'noticed must be True or False, got 1'),
+    (lambda: faults.WrongGeometry(wheel_separation_multiplier=0.0), 'in [0.01, 100], got 0.0'),
+    (lambda: faults.Slip(robot=''), 'robot must be a string that is not empty'),
+    (lambda: faults.Corrupt('odom', 'x', 'broken'), "change must be one of 'nan', 'inf'"),
+    (lambda: faults.Corrupt('odom', 'x', 'offset', INF - INF), "amount of 'offset' must be a finite"),
+    (lambda: faults.Corrupt('odom', 'x', 'scale', 'x'), "of 'scale' must be a finite number, got 'x'"),
+    (lambda: faults.Corrupt('odom', 'x', 'offset', True), 'must be a finite number, got True'),
+    (lambda: faults.Corrupt('odom', 'x', 'set', INF), "or a str (for others there are 'nan', 'inf'"),
+    (lambda: faults.Corrupt('odom', 'x', 'set', None), 'a bool or a str'),
+    (lambda: faults.Corrupt('odom', 'x', 'nan', 2.0), "must not be given with change 'nan', got 2.0"),
+    (lambda: faults.Corrupt('odom', '', 'nan'), 'field must be a string'),
+]
 
 
-@pytest.mark.parametrize(
-    ('make', 'words'),
-    [
-        (lambda: faults.Loss(''), "topic must be a string that is not empty, got ''"),
-        (lambda: faults.Loss('a', node=3), 'node must be a string, got 3'),
-        (lambda: faults.Loss('a', probability=1.5), r'probability must be in \[0, 1\], got 1.5'),
-        (lambda: faults.Loss('a', probability='x'), "probability must be a number, got 'x'"),
-        (lambda: faults.Loss('a', burst=0), 'burst must be an integer of at least 1, got 0'),
-        (lambda: faults.Loss('a', burst=True), 'burst must be an integer of at least 1, got True'),
-        (lambda: faults.Loss('a', start=-1), 'start must be zero or positive and finite, got -1'),
-        (lambda: faults.Loss('a', start=INF), 'start must be zero or positive and finite, got inf'),
-        (
-            lambda: faults.Loss('a', duration=0.0),
-            'duration must be positive, got 0',
-        ),
-        (
-            lambda: faults.Delay('a', float('nan')),
-            'must be zero or positive and finite, got nan',
-        ),
-        (lambda: faults.Reorder('a', 0.5, 0.0), 'seconds must be positive and finite, got 0.0'),
-        (lambda: faults.Duplicate('a', copies=1.5), 'copies must be an integer of at least 1, got 1.5'),
-        (lambda: faults.RateLimit('a', 0), 'rate must be positive and finite, got 0'),
-        (lambda: faults.Slow('a', -1.0), 'seconds must be positive and finite, got -1.0'),
-        (lambda: faults.TimeJump(0.0), 'seconds must not be zero, got 0.0'),
-        (lambda: faults.TimeJump(INF), 'seconds must be finite, got inf'),
-        (lambda: faults.LateService('a', 0.0), 'seconds must be positive, got 0.0'),
-        (lambda: faults.ParameterChange('a', 'b', None), 'value must be a bool, int, float, str, or a'),
-        (lambda: faults.ParameterChange('a', 'b', [1, 'x']), r"got \[1, 'x'\]"),
-    ],
-)
+@pytest.mark.parametrize(('make', 'words'), INVALID)
 def test_invalid_values_are_named(make, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=re.escape(words)):
         make()
 
 

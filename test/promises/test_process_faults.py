@@ -12,6 +12,8 @@ import pytest
 from process_faults import ends, fuzzed_parameters, hostile, recording, stopped
 from process_faults.worlds import quiet_world
 
+pytestmark = pytest.mark.process
+
 
 @pytest.fixture
 def world(tmp_path):
@@ -52,15 +54,15 @@ def test_a_controller_is_stopped_and_continued(world, monkeypatch):
 def test_fuzzed_parameters(world):
     chance = random.Random(1)
     fuzzer = fuzzed_parameters.Fuzzer(world, 'go_to_goal', chance)
-    for _ in range(60):
+    for _ in range(30):
         fuzzer.change()
     assert fuzzer.violations == []
-    assert fuzzed_parameters.start_up(world.harness, chance, 12) == []
+    assert fuzzed_parameters.start_up(world.harness, chance, 3) == []
 
 
 def test_hostile_messages(world):
     case = next(one for one in hostile.INPUTS if (one.node, one.topic) == ('go_to_goal', 'goals'))
-    violations, _ = hostile.Attack(world, case, random.Random(1)).run(600)
+    violations, _ = hostile.Attack(world, case, random.Random(1)).run(200)
     assert violations == []
 
 

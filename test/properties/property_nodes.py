@@ -2,33 +2,45 @@
 
 from __future__ import annotations
 
-from math import cos, sin
-
+from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import LEAN
+from support.ros_messages import goal, odometry
+from support.ros_messages import twist as command
+
+TOPICS = {
+    Odometry: 'odom',
+    Twist: 'cmd_vel',
+    PoseStamped: 'goal_pose',
+    Path: 'path',
+    GoalStatus: 'goal_status',
+}
 
 
-class Sender:
-    """Publishers of a test that need no subscription."""
+class Scene:
+    """Publishes messages on their topics, with time between them, and finishes."""
 
     def __init__(self, world):
-        self._world = world
-        self._publishers = {}
+        self._world, self._publishers = world, {}
 
-    def __call__(self, topic, message):
-        key = type(message), topic
+    def send(self, message, topic=None):
+        """Publish a message, whether or not there is a subscription."""
+        key = type(message), topic or TOPICS[type(message)]
         if key not in self._publishers:
             self._publishers[key] = self._world.node.create_publisher(*key, 10)
         self._publishers[key].publish(message)
 
-
-def twist(v, omega=0.0):
-    message = Twist()
-    message.linear.x, message.angular.z = float(v), float(omega)
-    return message
+    def __call__(self, *events):
+        for event in events:
+            if isinstance(event, float):
+                self._world.run_for(event)
+            else:
+                self.send(event)
+                self._world.settle()
+        self._world.finish()
 
 
 class Student(Node):
@@ -55,32 +67,22 @@ class Student(Node):
         return response
 
 
+def twist(v, omega=0.0):
+    return command(v, omega)
+
+
 def odometry_at(x, y=0.0, v=0.0, theta=0.0):
-    message = Odometry()
-    message.pose.pose.position.x, message.pose.pose.position.y = float(x), float(y)
-    message.pose.pose.orientation.z, message.pose.pose.orientation.w = sin(theta / 2), cos(theta / 2)
-    message.twist.twist.linear.x = float(v)
+    message = odometry(x, y, theta)
+    message.twist.twist = twist(v)
     return message
 
 
 def goal_at(x, y=0.0, stamp=0):
-    message = PoseStamped()
-    message.pose.position.x, message.pose.position.y = float(x), float(y)
-    message.pose.orientation.w = 1.0
-    message.header.stamp.sec = stamp
+    return goal(x, y, stamp=stamp)
+
+
+def status(number, stamp=1, uuid=1):
+    message = GoalStatus(status=number)
+    message.goal_info.stamp.sec = stamp
+    message.goal_info.goal_id.uuid[0] = uuid
     return message
-
-
-class Scene:
-    """Sends goals and odometry, with time between them, and finishes."""
-
-    def __init__(self, world):
-        self._world, self._send = world, Sender(world)
-
-    def __call__(self, *events):
-        for event in events:
-            if isinstance(event, float):
-                self._world.run_for(event)
-            else:
-                self._send('goal_pose' if isinstance(event, PoseStamped) else 'odom', event)
-        self._world.finish()

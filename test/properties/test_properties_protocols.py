@@ -1,15 +1,24 @@
-"""The status of goals, goals that are out of date, and canceling."""
+"""Goals, canceling and paths with nodes that keep their protocols, and others that do not."""
 
 from __future__ import annotations
 
 import pytest
-from action_msgs.msg import GoalStatus
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, Twist
-from property_nodes import Sender, Student, goal_at, twist
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path
+from property_nodes import Scene, Student, goal_at, odometry_at, status, twist
 from std_srvs.srv import Trigger
-from support.lockstep_nodes import ABORTED, ACCEPTED, CANCELED, EXECUTING, SUCCEEDED, make
+from support.lockstep_nodes import (
+    ABORTED,
+    ACCEPTED,
+    CANCELED,
+    EXECUTING,
+    SUCCEEDED,
+    change,
+    make,
+)
+from support.ros_messages import path
 
+from diffdrive_jacobian.control import figure_eight_path
 from diffdrive_jacobian.faults import Duplicate, Reorder
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.properties import (
@@ -17,96 +26,39 @@ from diffdrive_jacobian.properties import (
     NoCommandAfterCancel,
     NoStaleGoals,
     StatusProtocol,
+    StaysOnPath,
 )
 from diffdrive_jacobian.testing import LockstepError, PropertyViolation
 
 
 @pytest.fixture
-def send(lockstep):
-    return Sender(lockstep)
+def scene(lockstep):
+    return Scene(lockstep)
 
 
 # --- Status
 
 
-def status(number, stamp=1, uuid=1):
-    message = GoalStatus(status=number)
-    message.goal_info.stamp.sec = stamp
-    message.goal_info.goal_id.uuid[0] = uuid
-    return message
-
-
-KEPT = [
-    [ACCEPTED],
-    [ACCEPTED, EXECUTING, SUCCEEDED],
-    [ACCEPTED, ACCEPTED, EXECUTING, EXECUTING, ABORTED],
-    [ACCEPTED, CANCELED],
-    [ABORTED],
-    [ACCEPTED, EXECUTING, CANCELED, (ACCEPTED, 2), (EXECUTING, 2), (SUCCEEDED, 2)],
-    [ACCEPTED, EXECUTING, (ABORTED, 2), EXECUTING, SUCCEEDED],
-]
-BROKEN = [
-    ([EXECUTING], 'EXECUTING of the goal with stamp 1.000000000 s .* as its first status; allowed: ACC'),
-    ([ACCEPTED, SUCCEEDED], 'SUCCEEDED of .* after ACCEPTED; allowed: ACCEPTED, EXECUTING, CANCELING'),
-    ([ACCEPTED, EXECUTING, ACCEPTED], 'ACCEPTED of .* after EXECUTING'),
-    (
-        [ACCEPTED, EXECUTING, SUCCEEDED, SUCCEEDED],
-        'SUCCEEDED of .* was SUCCEEDED already; allowed: noth',
-    ),
-    ([ACCEPTED, EXECUTING, SUCCEEDED, CANCELED], 'CANCELED of .* was SUCCEEDED already'),
-    ([ABORTED, ACCEPTED], 'ACCEPTED of .* was ABORTED already'),
-    ([ACCEPTED, (ACCEPTED, 2)], 'while the goal before is ACCEPTED; allowed: after its terminal status'),
-    ([0], '0 of .* as its first status'),
-    ([17], '17 of .* as its first status'),
-]
-
-
-def publish_statuses(lockstep, send, sequence, **kwargs):
-    for one in sequence:
-        number, *stamp = one if isinstance(one, tuple) else (one,)
-        send('goal_status', status(number, *stamp, **kwargs))
-        lockstep.settle()
-    lockstep.finish()
-
-
-def test_status_protocol(lockstep, send):
-    for sequence in KEPT:
-        lockstep.require(StatusProtocol())
-        publish_statuses(lockstep, send, sequence)
-
-
-def test_status_protocol_broken(lockstep, send):
-    for sequence, words in BROKEN:
-        lockstep.require(StatusProtocol())
-        with pytest.raises(PropertyViolation, match=words):
-            publish_statuses(lockstep, send, sequence)
-
-
-def test_a_goal_without_identifier_may_be_accepted_again_when_it_is_received_again(lockstep, send):
-    publisher = lockstep.node.create_publisher(GoalStatus, 'goal_status', 10)
-
+def test_a_goal_without_identifier_may_be_accepted_again_when_it_is_received_again(lockstep, scene):
     def answer(goal):
         for number in (ACCEPTED, EXECUTING, SUCCEEDED):
-            message = status(number, uuid=0)
-            message.goal_info.stamp = goal.header.stamp
-            publisher.publish(message)
+            scene.send(status(number, goal.header.stamp.sec, uuid=0))
 
     lockstep.node.create_subscription(PoseStamped, 'goal_pose', answer, 10)
     lockstep.require(StatusProtocol())
-    goal = PoseStamped()
-    goal.header.stamp = Time(sec=3)
+    goal = goal_at(0.0, stamp=3)
     for _ in range(3):
         lockstep.publish('goal_pose', goal)
+    answer(goal)
     with pytest.raises(
-        PropertyViolation, match=r'ACCEPTED of the goal with stamp 3.0+ s, which was SUCC'
+        PropertyViolation, match=r'ACCEPTED of the goal with stamp 3.0+ s, which was SUC'
     ):
-        answer(goal) or lockstep.settle()
+        lockstep.settle()
 
 
-def test_the_controller_of_this_package_keeps_the_status_protocol(lockstep, robot_at, team):
+def test_the_controller_of_this_package_keeps_the_status_protocol(lockstep, team):
     lockstep.require(StatusProtocol(), NeverFasterThan(5.0, 30.0))
-    goal = PoseStamped()
-    goal.pose.position.x = 0.1
+    goal = goal_at(0.1)
     for _ in range(2):
         lockstep.publish('goal_pose', goal)
         lockstep.run_for(0.05)
@@ -120,24 +72,22 @@ def test_the_controller_of_this_package_keeps_the_status_protocol(lockstep, robo
 # --- Canceling
 
 
-def test_no_command_after_cancel(lockstep, robot_at):
+def test_no_command_after_cancel(lockstep, robot_at, scene):
     robot_at()
     student = lockstep.add(Student())
-    other = lockstep.node.create_publisher(Twist, 'cmd_vel', 10)
     lockstep.require(NoCommandAfterCancel())
     lockstep.run_for(0.1)
     student.command = twist(0.0)
     lockstep.call(Trigger, 'cancel_goal')
-    other.publish(twist(0.5))
+    # Of another one.
+    scene.send(twist(0.5))
     lockstep.run_for(0.1)
-    lockstep.publish('goal_pose', PoseStamped())
+    lockstep.publish('goal_pose', goal_at(1.0))
     student.command = twist(0.2)
     lockstep.run_for(0.1)
     lockstep.call(Trigger, 'cancel_goal')
-    with pytest.raises(
-        PropertyViolation,
-        match=r'/cmd_vel: v 0.2 m/s, .* 0.02 s after /student has responded to /cancel_goal; allowed',
-    ):
+    words = r'/cmd_vel: v 0.2 m/s, .* 0.02 s after /student has responded to /cancel_goal; allowed'
+    with pytest.raises(PropertyViolation, match=words):
         lockstep.run_for(0.1)
 
 
@@ -153,45 +103,53 @@ def test_a_service_that_no_node_has_is_an_error_at_the_end(lockstep, robot_at):
 # --- Goals that are out of date
 
 
-@pytest.mark.parametrize(
-    ('stamps', 'old'),
-    [((1, 2, 3), None), ((0, 0, 2, 0, 3), None), ((1, 3, 2), 2), ((1, 2, 2), 2)],
-)
-def test_no_stale_goals(lockstep, send, stamps, old):
+def test_goals_after_a_jump_of_the_clock_are_not_old(lockstep, scene):
     lockstep.require(NoStaleGoals())
-    for number, stamp in enumerate(stamps):
-        send('goal_status', status(EXECUTING, stamp=1, uuid=number))
-        send('goal_status', status(ACCEPTED, stamp=stamp, uuid=number))
-    if old is None:
-        lockstep.finish()
-        return
-    with pytest.raises(
-        PropertyViolation, match=rf'ACCEPTED of the goal with stamp {old}\.0+ s, after one'
-    ):
-        lockstep.finish()
-
-
-def test_goals_after_a_jump_of_the_clock_are_not_old(lockstep, send):
-    lockstep.require(NoStaleGoals())
-    send('goal_status', status(ACCEPTED, stamp=5))
+    scene.send(status(ACCEPTED, stamp=5))
     lockstep.run_for(2.0)
     lockstep.jump(-1.0)
-    send('goal_status', status(ACCEPTED, stamp=2))
-    lockstep.finish()
+    scene(status(ACCEPTED, stamp=2))
 
 
-@pytest.mark.parametrize('fault', [Duplicate('goal_pose', seconds=0.5), Reorder('goal_pose', 1.0, 0.5)])
-def test_a_late_goal_is_accepted_by_the_controller_of_this_package(lockstep, fault):
+@pytest.mark.parametrize('late', [Duplicate('goal_pose', seconds=0.5), Reorder('goal_pose', 1.0, 0.5)])
+def test_a_late_goal_is_accepted_by_the_controller_of_this_package(lockstep, late):
     """It takes goals in the order of arrival, also without stamps."""
     lockstep.add(make(GoToGoal))
     lockstep.require(NoStaleGoals())
-    lockstep.inject(fault)
+    lockstep.inject(late)
     lockstep.publish('goal_pose', goal_at(1.0, stamp=1))
     lockstep.run_for(0.1)
     lockstep.publish('goal_pose', goal_at(2.0, stamp=2))
-    if isinstance(fault, Reorder):
+    if isinstance(late, Reorder):
         lockstep.run_for(1.0)
         lockstep.finish()
         return
     with pytest.raises(PropertyViolation, match='ACCEPTED of the goal with stamp 1'):
         lockstep.run_for(1.0)
+
+
+# --- Paths
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('lookahead', [None, 0.8])
+def test_go_to_goal_stays_on_an_eight_unless_it_looks_far_ahead(lockstep, robot_at, lookahead):
+    robot_at()
+    node = lockstep.add(make(GoToGoal))
+    lockstep.require(StaysOnPath(0.03, within=24.0))
+    if lookahead:
+        change(node, lookahead_distance=lookahead)
+    lockstep.publish('path', path(*figure_eight_path(0.6).poses.tolist()))
+    if lookahead is None:
+        lockstep.run_for(24.0)
+        lockstep.finish()
+        return
+    with pytest.raises(PropertyViolation, match=r'm from the path and .* allowed: 0.03 m from'):
+        lockstep.run_for(30.0)
+
+
+def test_bytes_that_are_no_path_replace_one(lockstep, scene):
+    lockstep.require(StaysOnPath(0.1))
+    scene.send(path((0, 0), (1, 0)))
+    lockstep.node.create_publisher(Path, 'path', 10).publish(b'')
+    scene(odometry_at(0.0, 9.0), 0.1)
