@@ -102,29 +102,6 @@ def test_drive_to_live_in_real_time(world):
 # --- Arguments
 
 
-@pytest.mark.parametrize(
-    ('tool', 'arguments', 'message'),
-    [
-        (watch_run, ['--port', '0'], 'must be an integer from 1 to 65535, got 0'),
-        (watch_run, ['--port', '99999'], 'must be an integer from 1 to 65535, got 99999'),
-        (watch_run, ['--rate', '2'], '--rate needs a BAG'),
-        (watch_run, ['bag', '--rate', '-2'], 'must be in [0.01, 1000], got -2.0'),
-        (watch_run, ['bag', '--rate', '1e9'], 'must be in [0.01, 1000], got 1000000000.0'),
-        (watch_run, ['bag', '--ros-args', '-p', 'x:=1'], 'a BAG needs no ROS arguments'),
-        (drive_to, [], 'X Y or --path (only --live needs no goal)'),
-        (drive_to, ['1', '1', '--no-browser'], 'are options of --live'),
-        (drive_to, ['1', '1', '--port', '8000'], 'are options of --live'),
-        (drive_to, ['1', '1', '--live', '--lockstep', '--open'], 'exclude each other'),
-        (drive_to, ['--live', '--timeout', '5'], '--timeout has no effect with --live'),
-    ],
-)
-def test_wrong_arguments(capsys, tool, arguments, message):
-    with pytest.raises(SystemExit) as ended:
-        tool.main(arguments, Signals())
-    assert ended.value.code == 2
-    assert message in capsys.readouterr().err
-
-
 def test_a_port_in_use_a_bag_that_is_none_and_a_missing_library(capsys, tmp_path, monkeypatch):
     with socket.create_server(('127.0.0.1', 0)) as taken:
         port = str(taken.getsockname()[1])
