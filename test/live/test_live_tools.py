@@ -37,6 +37,7 @@ def robots(page):
     return {one['name']: one for one in json.loads(page.recv(timeout=20))['robots']}
 
 
+@pytest.mark.process
 def test_watch_run_beside_nodes_and_the_robot_stops_with_the_page(world):
     """In processes of their own, by DDS. It ends by Ctrl-C, and so does driving by hand."""
     robot = world.start('virtual_robot', '--ros-args', '-r', '__ns:=/r')
@@ -61,6 +62,7 @@ def test_watch_run_beside_nodes_and_the_robot_stops_with_the_page(world):
     assert robot.exit() == 0
 
 
+@pytest.mark.process
 def test_drive_to_live_waits_for_the_page_records_and_ends_by_a_signal(world, tmp_path):
     bag = str(tmp_path / 'bag')
     drive = world.start(
@@ -90,6 +92,7 @@ def test_drive_to_live_waits_for_the_page_records_and_ends_by_a_signal(world, tm
     assert watch.exit() == 0
 
 
+@pytest.mark.process
 def test_drive_to_live_in_real_time(world):
     drive = world.start('drive_to', '0.1', '0', '--live', '--no-record', '--no-browser', *QUICK)
     with opened(drive) as page:

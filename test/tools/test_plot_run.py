@@ -460,7 +460,7 @@ def test_odometry_of_the_instant_of_a_new_beginning_may_be_from_before(tmp_path)
 
 def test_many_runs_are_drawn(recorded_plain, tmp_path):
     run = read_run(recorded_plain)
-    _figure.draw([replace(run, path=Path(f'run_{index}')) for index in range(40)], tmp_path / 'a.png')
+    _figure.draw([replace(run, path=Path(f'run_{index}')) for index in range(20)], tmp_path / 'a.png')
     assert (tmp_path / 'a.png').exists()
 
 
