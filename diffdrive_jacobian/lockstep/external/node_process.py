@@ -59,6 +59,8 @@ REPETITION = 1.0
 """Period at which a request is repeated while a process starts (s): a response may be lost then."""
 SILENCE = 0.2
 """Time for which a process that has started must not send anything by itself (s)."""
+SUBSCRIBING = 3.0
+"""Least time until a node must be subscribed to /clock (s): its name may be discovered before."""
 UNCONFIRMED = 0.5
 """Time for nodes without parameter services to discover the endpoints of the world (s)."""
 UNASKED = 100
@@ -341,6 +343,7 @@ class NodeProcess:
     def _connect(self) -> None:
         """Wait until the nodes of the process and the world have discovered each other."""
         allowance = Allowance(self._quiet, self._command.timeout)
+        subscribing: Allowance | None = None
         while True:
             while not (self._learn() and self._is_matched()):
                 self.child.check_running()
@@ -351,8 +354,16 @@ class NodeProcess:
             self._confirm(allowance)
             graph_changed(self._outside)
             if self._learn() and len(self._relays) == known:
-                break
-        self._check_timed()
+                if not (untimed := self._untimed()):
+                    break
+                subscribing = subscribing or Allowance(self._quiet, SUBSCRIBING)
+                if subscribing.is_used_up():
+                    raise LockstepError(
+                        f'{", ".join(untimed)} of {self.command} is not subscribed to /clock: its '
+                        'parameter use_sim_time must be true; if it needs no time: '
+                        'start(..., use_sim_time=False)'
+                    )
+                time.sleep(SILENCE)
         self._wait()
         # Others than latched ones came before anybody could be subscribed.
         self._latched = [arrived for arrived in self._take() if arrived.latched]
@@ -490,19 +501,14 @@ class NodeProcess:
             response = take_response(client) or response
         self._outside.destroy_client(client)
 
-    def _check_timed(self) -> None:
-        """Check that the nodes receive the time."""
+    def _untimed(self) -> list[str]:
+        """Return the nodes that should receive the time and do not, as far as is discovered."""
         timed = {
             node_of(info)
             for topic in self._clock_publishers
             for info in self._outside.get_subscriptions_info_by_topic(topic)
         }
-        untimed = sorted(self._stand_ins.keys() - timed)
-        if self._command.use_sim_time and untimed:
-            raise LockstepError(
-                f'{", ".join(untimed)} of {self.command} is not subscribed to /clock: its parameter '
-                'use_sim_time must be true; if it needs no time: start(..., use_sim_time=False)'
-            )
+        return sorted(self._stand_ins.keys() - timed) if self._command.use_sim_time else []
 
     def _not_discovered(self) -> str:
         waited = f'within {self._command.timeout:g} s (timeout=)'

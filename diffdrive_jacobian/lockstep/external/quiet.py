@@ -195,6 +195,8 @@ class Quiet:
             if tries == MANY_TRIES:
                 allowance = Allowance(self, patience)
             if allowance is not None and allowance.is_used_up():
+                # The cause, also if another thread is about to run.
+                any(map(self._is_stopped, self._links))
                 raise LockstepError(f'not quiet within {patience:g} s: {self.describe()}')
             time.sleep(PAUSE)
 
