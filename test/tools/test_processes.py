@@ -28,7 +28,7 @@ def world(tmp_path):
 
 def test_nodes_exit_0_on_a_signal(world):
     signals = [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT)]
-    children = [(world.start(name), numbers) for name in NODES for numbers in signals]
+    children = [(world.start(name), numbers) for name, numbers in zip(NODES, signals, strict=True)]
     for child, numbers in children:
         child.until_says('subscribed to ')
         for number in numbers:
