@@ -32,7 +32,7 @@ LONGEST_FIRST = (
     *('test_pages', 'test_explored_nodes', 'test_forked', 'test_salvage', 'test_processes'),
     *('test_replay_run', 'test_recover_crash', 'test_calibrate_run', 'test_exploration'),
     *('test_external', 'test_own_controllers', 'test_fixtures', 'test_se2', 'test_process_faults'),
-    *('test_record_run', 'test_recording', 'test_live_browser', 'test_secondary_tracking'),
+    *('test_record_run', 'test_recording', 'test_live_browser'),
     *('test_flood', 'test_calibration', 'test_faults_same', 'test_tools'),
 )
 """Files with tests that take seconds. They start first, so that none is left for the end."""

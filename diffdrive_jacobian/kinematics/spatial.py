@@ -31,9 +31,10 @@ def _rigid(name: str, T: Array) -> None:
     """
     finite(name, T)
     R = T[..., :3, :3]
-    with np.errstate(over='ignore', invalid='ignore'):
+    with np.errstate(all='ignore'):
         skew = np.linalg.norm(np.swapaxes(R, -1, -2) @ R - np.eye(3), axis=(-2, -1))
-    inside = (skew < ROUNDING) & (np.linalg.det(R) > 0.0) & np.all(T[..., 3, :] == (0, 0, 0, 1), axis=-1)
+        proper = np.linalg.det(R) > 0.0
+    inside = (skew < ROUNDING) & proper & np.all(T[..., 3, :] == (0, 0, 0, 1), axis=-1)
     if not inside.all():
         raise ValueError(
             f'{name} must be [[R, p], [0, 0, 0, 1]] with a rotation matrix R, '

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from diffdrive_jacobian.kinematics.joint_limits import limit_velocity
 from diffdrive_jacobian.kinematics.singular_values import norm, product, root, svd, times
 from diffdrive_jacobian.numerics.checks import array, finite, leading, not_negative, number, positive
+from diffdrive_jacobian.numerics.fields import short
 from diffdrive_jacobian.numerics.formula import Array, entries_first, entries_last
 
 
@@ -101,7 +102,7 @@ def _checked(tasks: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[Array, 
     try:
         pairs = [(J, x_dot) for J, x_dot in tasks]
     except (TypeError, ValueError):
-        raise ValueError(f'tasks must be pairs (J, x_dot), got {tasks!r:.60}') from None
+        raise ValueError(f'tasks must be pairs (J, x_dot), got {short(tasks, repr)}') from None
     if not pairs:
         raise ValueError('tasks must contain at least one (J, x_dot), got none')
     checked = []

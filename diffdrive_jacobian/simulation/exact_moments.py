@@ -167,7 +167,11 @@ def _noise(alpha: float, turn: float, nu: float, beta: float, m: float) -> Noise
     """Compute the moments of the noise of one arc; None: there is no noise."""
     if not m:
         return None
-    halvings = max(0, math.frexp((2.0 * abs(turn) + 4.0 * m) / RADIUS)[1])
+    size = 2.0 * abs(turn) + 4.0 * m
+    if not isfinite(size):
+        # The series would have no end.
+        raise OverflowError(f'the arc must be finite, got {size}')
+    halvings = max(0, math.frexp(size / RADIUS)[1])
     alpha, turn, nu, beta, m = (part * 2.0**-halvings for part in (alpha, turn, nu, beta, m))
     noise = series(alpha, turn, nu, beta, m)
     for _ in range(halvings):

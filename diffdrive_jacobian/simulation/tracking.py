@@ -18,6 +18,7 @@ from diffdrive_jacobian.kinematics.inverse_kinematics import pose_difference
 from diffdrive_jacobian.kinematics.inverse_velocity import damping as damping_factor
 from diffdrive_jacobian.kinematics.inverse_velocity import manipulability
 from diffdrive_jacobian.numerics.checks import array, leading, not_negative, number, positive
+from diffdrive_jacobian.numerics.fields import short
 from diffdrive_jacobian.numerics.formula import Array
 
 MAX_STEPS = 1e8
@@ -111,7 +112,7 @@ def track_line(
     """
     _check_callables(robot, secondary)
     if not isinstance(line, StraightLine):
-        raise ValueError(f'line must be a control.StraightLine, got {line!r:.60}')
+        raise ValueError(f'line must be a control.StraightLine, got {short(line, repr)}')
     rate = number('rate', rate, positive)
     settling = number('settling', settling, not_negative)
     gain = number('gain', gain, not_negative)
@@ -177,9 +178,11 @@ def _error(x_desired: Array, x: Array) -> Array:
 def _check_callables(robot: Manipulator, secondary: object) -> None:
     for method in ('forward_kinematics', 'jacobian', 'integrate'):
         if not callable(getattr(robot, method, None)):
-            raise ValueError(f'robot must have the method {method}, got {robot!r:.60}')
+            raise ValueError(f'robot must have the method {method}, got {short(robot, repr)}')
     if secondary is not None and not callable(secondary):
-        raise ValueError(f'secondary must be a function of the configuration, got {secondary!r:.60}')
+        raise ValueError(
+            f'secondary must be a function of the configuration, got {short(secondary, repr)}'
+        )
 
 
 def _inputs(

@@ -1,14 +1,14 @@
-"""Closed loops in batches against one robot in a scalar loop, and what becomes of who gets lost."""
+"""Closed loops in batches compared with one robot in a scalar loop, and robots that get lost."""
 
 from __future__ import annotations
 
 import itertools
 import math
 import tracemalloc
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from diffdrive_jacobian.control import (
     Arrival,
@@ -19,6 +19,7 @@ from diffdrive_jacobian.control import (
     offset_point,
     saturate,
 )
+from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loop, closed_loops, trajectories
@@ -61,7 +62,11 @@ def alone(law, start, to, gains, arrival, limits=FREE, *, rate=50.0, duration=6.
 
 def assert_same(found, expected):
     for name, one, other in zip(found._fields, found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9, err_msg=name)
+        assert_allclose(one, other, rtol=1e-9, atol=1e-9, err_msg=name)
+
+
+def row(outcomes, index):
+    return type(outcomes)(*(field[index] for field in outcomes))
 
 
 @pytest.mark.parametrize('use_heading', [False, True], ids=['position', 'heading'])
@@ -69,77 +74,44 @@ def assert_same(found, expected):
 @pytest.mark.parametrize('name', LAWS)
 def test_a_batch_is_each_of_its_robots_in_a_scalar_loop(name, limits, use_heading):
     law, gains = LAWS[name]
-    starts, targets = random_batch(1, 5)
+    starts, targets = random_batch(1, 3)
     targets[0] = starts[0]
     arrival = Arrival(use_heading=use_heading, offset=gains[1] if name == 'offset_point' else 0.0)
-    gone = trajectories(law, starts, targets, *gains, duration=6.0, arrival=arrival, limits=limits)
-    assert_same(
-        closed_loops(law, starts, targets, *gains, duration=6.0, arrival=arrival, limits=limits),
-        gone.outcomes,
-    )
-    np.testing.assert_allclose(gone.times, np.arange(len(gone.poses)) / 50.0, rtol=1e-12)
+    how = {'duration': 4.0, 'arrival': arrival, 'limits': limits}
+    gone = trajectories(law, starts, targets, *gains, **how)
+    assert_same(closed_loops(law, starts, targets, *gains, **how), gone.outcomes)
+    assert_allclose(gone.times, np.arange(len(gone.poses)) / 50.0, rtol=1e-12)
     for index, (start, to) in enumerate(zip(starts, targets, strict=True)):
-        expected, poses = alone(law, start, to, gains, arrival, limits)
-        assert_same(type(gone.outcomes)(*(field[index] for field in gone.outcomes)), expected)
-        np.testing.assert_allclose(gone.poses[: len(poses), index], poses, atol=1e-9)
+        expected, poses = alone(law, start, to, gains, arrival, limits, duration=4.0)
+        assert_same(row(gone.outcomes, index), expected)
+        assert_allclose(gone.poses[: len(poses), index], poses, atol=1e-9)
         # Who has arrived stands still.
         assert np.all(gone.poses[len(poses) - 1 :, index] == gone.poses[-1, index])
         assert not gone.twists[len(poses) - 1 :, index].any()
-    assert gone.outcomes.arrived.sum() >= 3
+    assert gone.outcomes.arrived.any()
 
 
-def test_the_robot_of_the_nodes_drives_the_same_path():
-    (start, to), gains = random_batch(2), (6.0, 1.5)
-    gone = trajectories(go_to_pose, start[np.newaxis], to, *gains, limits=LIMITS)
-    model = RobotModel(limits=LIMITS)
-    robot = Robot(model=model, stamp=0, pose=start)
-    for pose in gone.poses[:, 0]:
-        np.testing.assert_allclose(robot.pose, pose, atol=1e-9)
-        stamp = robot.stamp
-        robot = robot.commanded(go_to_pose(robot.pose, to, *gains), stamp).at(stamp + 20_000_000)
-    assert len(gone.poses) > 50
-
-
-@pytest.mark.parametrize('drive', [closed_loops, lambda *a, **k: trajectories(*a, **k).outcomes])
-def test_a_single_robot_is_a_batch_without_axes(drive):
+def test_a_single_robot_is_a_batch_without_axes():
     (start, to), gains = random_batch(3), (6.0, 1.5)
-    found = drive(go_to_pose, start, to, *gains)
-    assert [np.shape(field) for field in found] == [()] * 5 + [(3,)]
-    assert_same(found, alone(go_to_pose, start, to, gains, Arrival())[0])
-
-
-def test_outcomes_are_those_of_the_trajectories():
-    starts, targets = random_batch(4, 3, 2)
-    r, separation = np.array([[0.01], [0.03], [0.05]]), np.array([0.1, 0.2])
-    robots = {'limits': LIMITS, 'r': r, 'L': separation, 'duration': 4.0}
-    gone = trajectories(go_to_pose, starts, targets, 6.0, 1.5, **robots)
-    count = len(gone.times)
-    assert gone.poses.shape == (count, 3, 2, 3)
-    assert gone.twists.shape == (count - 1, 3, 2, 2)
-    v, omega = np.moveaxis(gone.twists, -1, 0)
-    wheels = np.array(body_to_wheel(v, omega, r, separation))
-    assert np.abs(wheels).max() <= 24.0 * (1.0 + 1e-12)
-    way, left = (one[..., :2] @ [1.0, 1j] for one in (targets - starts, targets - gone.poses))
-    beyond = np.maximum(-(left * way.conj()).real / np.abs(way), 0.0).max(axis=0)
-    there, arrived = np.abs(left) <= 0.02, (np.abs(left) <= 0.02).any(axis=0)
-    time = np.where(arrived, gone.times[there.argmax(axis=0)], np.nan)
-    path, effort = np.abs(v).sum(axis=0) / 50.0, (wheels**2).sum(axis=(0, 1)) / 50.0
-    assert_same(gone.outcomes, (arrived, time, path, effort, beyond, gone.poses[-1]))
-    moved = se2.integrate(gone.poses[:-1], gone.twists, 0.02)
-    np.testing.assert_allclose(moved[..., :2], gone.poses[1:, ..., :2], atol=1e-12)
-    assert 0 < gone.outcomes.arrived.sum() < 6
+    expected, _ = alone(go_to_pose, start, to, gains, Arrival())
+    for found in (
+        closed_loops(go_to_pose, start, to, *gains),
+        trajectories(go_to_pose, start, to, *gains).outcomes,
+    ):
+        assert [np.shape(field) for field in found] == [()] * 5 + [(3,)]
+        assert_same(found, expected)
 
 
 def test_starts_gains_robots_limits_and_offsets_broadcast():
-    starts, targets = random_batch(5, 3, 1, 1, 1)
+    starts, targets = random_batch(5, 2, 1, 1, 1)
     k, d = np.array([[[0.8]], [[2.0]]]), np.array([[0.1], [-0.3]])
     r, separation, max_v = np.array([0.02, 0.05]), np.array([0.2, 0.1]), np.array([[0.3], [np.inf]])
-    min_omega = np.array([[[[-0.5]]], [[[-1.0]]], [[[-np.inf]]]])
+    min_omega = np.array([[[[-0.5]]], [[[-np.inf]]]])
     limits = VelocityLimits(max_v=max_v, min_omega=min_omega, max_wheel_speed=9.0)
-    robots = {'arrival': Arrival(offset=d), 'limits': limits, 'r': r, 'L': separation, 'duration': 6.0}
+    robots = {'arrival': Arrival(offset=d), 'limits': limits, 'r': r, 'L': separation, 'duration': 3.0}
     found = closed_loops(offset_point, starts, targets[..., :2], k, d, **robots)
-    assert found.time.shape == (3, 2, 2, 2)
-    for i, j, m, n in np.ndindex(3, 2, 2, 2):
+    assert found.time.shape == (2, 2, 2, 2)
+    for i, j, m, n in np.ndindex(2, 2, 2, 2):
         one, _ = alone(
             lambda at, to, *gains: offset_point(at, to[:2], *gains),
             *(starts[i, 0, 0, 0], targets[i, 0, 0, 0], (k[j, 0, 0], d[m, 0])),
@@ -147,23 +119,24 @@ def test_starts_gains_robots_limits_and_offsets_broadcast():
             VelocityLimits(max_v=max_v[m, 0], min_omega=min_omega[i, 0, 0, 0], max_wheel_speed=9.0),
             r=r[n],
             separation=separation[n],
+            duration=3.0,
         )
-        assert_same(type(found)(*(field[i, j, m, n] for field in found)), one)
-    assert len(np.unique(found.control_cost)) > 20
+        assert_same(row(found, (i, j, m, n)), one)
+    assert len(np.unique(found.control_cost)) > 12
 
 
 @pytest.mark.parametrize('block', [1, 3])
 def test_neither_order_nor_block_size_matters(monkeypatch, block):
-    starts, targets = random_batch(6, 8)
-    Kp, arrival = np.linspace(6.0, 12.0, 8), Arrival(use_heading=True)
+    starts, targets = random_batch(6, 5)
+    Kp, arrival = np.linspace(6.0, 12.0, 5), Arrival(use_heading=True)
 
     def drive(order, drive=closed_loops):
         rows = starts[order], targets[order], Kp[order], 2.0
         return drive(go_to_pose, *rows, limits=LIMITS, arrival=arrival, duration=4.0)
 
-    expected = drive(np.arange(8))
+    expected = drive(np.arange(5))
     monkeypatch.setattr(closed_loop, 'BLOCK', block)
-    order = np.random.default_rng(7).permutation(8)
+    order = np.random.default_rng(7).permutation(5)
     assert_same(drive(order), [field[order] for field in expected])
     assert_same(drive(order, trajectories).outcomes, [field[order] for field in expected])
 
@@ -174,61 +147,40 @@ def test_each_robot_turns_in_place_with_its_own_gain():
         go_to_pose, np.zeros((2, 3)), [0.0, 0.0, 1.0], 3.0, 0.5, arrival=arrival, turning_gain=gains
     )
     steps = np.ceil(np.log(0.02) / np.log(1.0 - gains / 50.0))
-    np.testing.assert_allclose(found.time, steps / 50.0)
+    assert_allclose(found.time, steps / 50.0)
     assert not found.path_length.any()
 
 
+@pytest.mark.parametrize('name', BUILT_IN)
+def test_a_controller_is_driven_as_its_checked_law(name):
+    controller, (starts, targets) = BUILT_IN[name], random_batch(13, 4)
+    goals = targets if controller.takes_heading else targets[:, :2]
+    found, expected = (
+        closed_loops(law, starts, goals, 3.0, 0.5, duration=2.0)
+        for law in (controller, lambda *each: controller.law(*each))
+    )
+    assert_same(found, expected)
+
+
 # --- Who does not arrive, and who is there
-
-
-def test_a_law_may_be_any_callable():
-    @dataclass
-    class Law:
-        gain: float
-
-        def __call__(self, poses, goals):
-            return go_to_goal(poses, goals, self.gain, 0.5)
-
-    found = closed_loops(Law(3.0), [0.0] * 3, [1.0, 1.0])
-    assert found.time == closed_loops(go_to_goal, [0.0] * 3, [1.0, 1.0], 3.0, 0.5).time
-
-
-def test_laws_give_the_shape_of_the_batch_whichever_argument_has_it():
-    Kp = np.full((2, 1), 3.0)
-    for v, omega in (
-        go_to_goal(np.zeros((7, 3)), [1.0, 1.0], Kp, 0.5),
-        go_to_goal(np.zeros((7, 3)), [1.0, 1.0], 3.0, Kp),
-        go_to_pose(np.zeros((7, 3)), [1.0, 1.0, 0.0], Kp, 0.5),
-        offset_point(np.zeros((7, 3)), [1.0, 1.0], Kp, 0.1),
-    ):
-        assert v.shape == omega.shape == (2, 7)
-
-
-def test_values_keep_their_own_numbers():
-    mine = np.array([1.0, 2.0])
-    limits, arrival = VelocityLimits(max_v=mine), Arrival(offset=mine)
-    v, omega = saturate(mine, mine, VelocityLimits(), R, L)
-    mine[0] = -5.0
-    assert limits.max_v[0] == arrival.offset[0] == v[0] == omega[0] == 1.0
 
 
 def test_who_never_arrives_has_no_time_and_is_where_the_time_ran_out():
     targets = [[0.5, 0.0], [9.0, 0.0], [-1.0, 0.0]]
     found = closed_loops(lambda pose, to: (0.1, 0.0), np.zeros((3, 3)), targets, duration=10.0)
     assert found.arrived.tolist() == [True, False, False]
-    np.testing.assert_allclose(found.time, [4.8, np.nan, np.nan])
-    np.testing.assert_allclose(found.pose[:, 0], [0.48, 1.0, 1.0])
+    assert_allclose(found.time, [4.8, np.nan, np.nan])
+    assert_allclose(found.pose[:, 0], [0.48, 1.0, 1.0])
     assert not found.pose[:, 1:].any()
-    np.testing.assert_allclose(found.path_length, [0.48, 1.0, 1.0])
-    np.testing.assert_allclose(found.control_cost, 2.0 * (0.1 / R) ** 2 * np.array([4.8, 10.0, 10.0]))
+    assert_allclose(found.path_length, [0.48, 1.0, 1.0])
+    assert_allclose(found.control_cost, 2.0 * (0.1 / R) ** 2 * np.array([4.8, 10.0, 10.0]))
 
 
-@pytest.mark.parametrize(('duration', 'arrives'), [(0.96, False), (0.98, True), (1.0, True)])
-def test_the_last_sample_counts(duration, arrives):
-    way = (np.zeros((1, 3)), [1.0, 0.0])
-    arrival = Arrival(xy_tolerance=0.03)
-    found = closed_loops(lambda pose, to: (1, 0), *way, duration=duration, arrival=arrival)
-    assert found.arrived.tolist() == [arrives]
+def test_the_last_sample_counts():
+    for duration, arrives in ((0.96, False), (0.98, True), (1.0, True)):
+        how = {'duration': duration, 'arrival': Arrival(xy_tolerance=0.03)}
+        found = closed_loops(lambda pose, to: (1, 0), np.zeros((1, 3)), [1.0, 0.0], **how)
+        assert found.arrived.tolist() == [arrives]
 
 
 def test_overshoot_is_measured_beyond_the_goal_along_the_line_from_the_start():
@@ -240,7 +192,7 @@ def test_overshoot_is_measured_beyond_the_goal_along_the_line_from_the_start():
     assert found.path_length == pytest.approx([9.0], rel=0.02)
 
 
-@pytest.mark.parametrize(('wild', 'count'), [(101.0, 1), (300.0, 1), (300.0, 5), (1e4, 40)])
+@pytest.mark.parametrize(('wild', 'count'), [(101.0, 1), (300.0, 5), (1e4, 40)])
 @pytest.mark.parametrize('law', [offset_point, go_to_goal])
 def test_a_law_that_diverges_has_not_arrived_and_leaves_its_company_alone(law, wild, count):
     """A gain beyond twice the rate."""
@@ -249,7 +201,7 @@ def test_a_law_that_diverges_has_not_arrived_and_leaves_its_company_alone(law, w
 
     def drive(function=closed_loops):
         others = [gains, 0.3] if law is offset_point else [3.0, gains]
-        return function(law, starts, targets[:, :2], *others, duration=10.0)
+        return function(law, starts, targets[:, :2], *others, duration=5.0)
 
     tame = drive()
     gains[lost] = wild
@@ -257,7 +209,7 @@ def test_a_law_that_diverges_has_not_arrived_and_leaves_its_company_alone(law, w
         assert not found.arrived[lost]
         assert np.isnan(found.time[lost])
         assert np.isfinite(found.pose).all()
-        assert_same(type(found)(*(field[~lost] for field in found)), [field[~lost] for field in tame])
+        assert_same(row(found, ~lost), row(tame, ~lost))
 
 
 def test_who_has_driven_away_a_thousand_kilometres_is_given_up():
@@ -271,14 +223,6 @@ def test_outcomes_that_overflow_are_an_error():
         closed_loops(go_to_goal, np.zeros(3), [1.0, 0.0], 3.0, 0.5, r=1e-160)
 
 
-def test_turning_gains_far_beyond_the_rate_raise_nothing():
-    starts, targets = random_batch(9, 100)
-    Kp = 10.0 ** np.linspace(2.1, 8.0, 100)
-    found = closed_loops(go_to_goal, starts, targets[:, :2], Kp, 0.5, duration=10.0)
-    assert np.array_equal(np.isnan(found.time), ~found.arrived)
-    assert np.isfinite(found.pose).all()
-
-
 def test_who_is_there_has_no_use_for_the_law_any_more():
     """Which may know no direction there."""
 
@@ -290,31 +234,25 @@ def test_who_is_there_has_no_use_for_the_law_any_more():
     starts[1:, 0] = -np.arange(1.0, 8.0)
     found = closed_loops(straight, starts, [0.0, 0.0])
     assert found.arrived.all()
-    np.testing.assert_allclose(found.time, np.maximum(-starts[:, 0] - 0.02, 0.0), atol=0.021)
+    assert_allclose(found.time, np.maximum(-starts[:, 0] - 0.02, 0.0), atol=0.021)
     assert [field[0] for field in found[1:5]] == [0.0] * 4
 
 
-def test_who_starts_on_the_goal_is_there_at_once():
-    starts, _ = random_batch(12, 3)
-    for function in (closed_loops, lambda *a: trajectories(*a).outcomes):
-        found = function(go_to_pose, starts, starts, 3.0, 0.5)
-        assert_same(found, ([True] * 3, *np.zeros((4, 3)), starts))
-
-
-@pytest.mark.parametrize('shape', [(0,), (3, 0), (0, 2)])
-def test_an_empty_batch_is_an_empty_result(shape):
-    said = []
-    found = closed_loops(go_to_goal, np.zeros((*shape, 3)), [1.0, 0.0], 3.0, 0.5, progress=said.append)
-    assert [field.shape for field in found] == [shape] * 5 + [(*shape, 3)]
-    assert not any(said)
-    gone = trajectories(go_to_goal, np.zeros((*shape, 3)), [1.0, 0.0], 3.0, 0.5)
-    assert gone.times.tolist() == [0.0]
-    assert (gone.poses.shape, gone.twists.shape) == ((1, *shape, 3), (0, *shape, 2))
+def test_an_empty_batch_is_an_empty_result():
+    for shape in ((0,), (3, 0)):
+        said = []
+        batch = np.zeros((*shape, 3)), [1.0, 0.0]
+        found = closed_loops(go_to_goal, *batch, 3.0, 0.5, progress=said.append)
+        assert [field.shape for field in found] == [shape] * 5 + [(*shape, 3)]
+        assert not any(said)
+        gone = trajectories(go_to_goal, *batch, 3.0, 0.5)
+        assert gone.times.tolist() == [0.0]
+        assert (gone.poses.shape, gone.twists.shape) == ((1, *shape, 3), (0, *shape, 2))
 
 
 def test_memory_does_not_grow_with_the_duration():
     peaks = []
-    for duration in (1.0, 1.0, 10.0):  # the first one also pays for what is made once
+    for duration in (0.4, 0.4, 4.0):  # the first one also pays for what is made once
         tracemalloc.start()
         closed_loops(lambda pose, to: (0.1, 1.0), np.zeros((1000, 3)), [9.0, 0.0], duration=duration)
         peaks.append(tracemalloc.get_traced_memory()[1])
@@ -323,110 +261,54 @@ def test_memory_does_not_grow_with_the_duration():
 
 
 @pytest.mark.parametrize('block', [5, 8192])
-def test_progress_counts_up_to_the_batch(monkeypatch, block):
+def test_progress_and_steps_are_reported_in_every_block(monkeypatch, block):
     monkeypatch.setattr(closed_loop, 'BLOCK', block)
     starts, targets = random_batch(10, 5, 3)
-    said = []
-    closed_loops(go_to_goal, starts, targets[..., :2], 3.0, 0.5, duration=8.0, progress=said.append)
+    batch, said, numbers = (go_to_goal, starts, targets[..., :2], 3.0, 0.5), [], []
+    how = {'duration': 8.0, 'rate': 20.0}
+    outcomes = closed_loops(*batch, **how, progress=said.append, on_step=numbers.append)
     assert all(sooner < later for sooner, later in itertools.pairwise([0, *said]))
     assert said[-1] == 15
-
-
-@pytest.mark.parametrize('block', [5, 8192])
-def test_on_step_is_called_at_every_step_of_every_block_and_its_exception_ends_the_batch(
-    monkeypatch, block
-):
-    monkeypatch.setattr(closed_loop, 'BLOCK', block)
-    starts, targets = random_batch(10, 5, 3)
-    arguments = go_to_goal, starts, targets[..., :2], 3.0, 0.5
-    numbers = []
-    outcomes = closed_loops(*arguments, duration=8.0, rate=20.0, on_step=numbers.append)
     assert numbers[0] == 0
     assert numbers == sorted(numbers)
-    blocks = math.ceil(15 / block)
     # One that never arrives takes all 160 steps and the sample after the last one.
     assert not outcomes.arrived.all()
-    assert 161 <= len(numbers) <= 161 * blocks
-    without = closed_loops(*arguments, duration=8.0, rate=20.0)
-    assert all(np.array_equal(*pair, equal_nan=True) for pair in zip(outcomes, without, strict=True))
+    assert 161 <= len(numbers) <= 161 * math.ceil(15 / block)
+    assert_same(outcomes, closed_loops(*batch, **how))
 
     def interrupt(_):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        closed_loops(*arguments, on_step=interrupt)
+        closed_loops(*batch, on_step=interrupt)
 
 
-# --- Laws of one's own
+# --- Laws of one's own, bad input
 
 
-def test_a_law_sees_rows_and_whatever_gains_it_was_given():
+def test_a_law_is_any_callable_that_sees_rows_and_whatever_gains_it_was_given():
     seen = set()
 
-    def law(poses, goals, one, many):
-        seen.add((poses.shape, goals.shape, np.shape(one), np.shape(many)))
-        return 0, np.float32(1.0)
+    class Law:
+        def __call__(self, poses, goals, one, many):
+            seen.add((poses.shape, goals.shape, np.shape(one), np.shape(many)))
+            return 0, np.float32(1.0)
 
-    closed_loops(law, np.zeros((2, 3, 3)), [1.0, 0.0], 4.0, np.ones((3,)), duration=1.0)
+    closed_loops(Law(), np.zeros((2, 3, 3)), [1.0, 0.0], 4.0, np.ones((3,)), duration=0.1)
     assert seen == {((6, 3), (6, 2), (), (6,))}
 
 
 NO_TWISTS = [
-    None,
-    1.0,
-    (1.0,),
-    (1.0, 2.0, 3.0),
-    'vw',
-    (1j, 0.0),
-    (np.zeros(3), 0.0),
-    (0.0, [[1.0], [2.0]]),
+    *(None, 1.0, (1.0,), (1.0, 2.0, 3.0), 'vw', (1j, 0.0)),
+    *((np.zeros(3), 0.0), (0.0, [[1.0], [2.0]])),
+    *((math.nan, 0.0), (0.0, math.inf), (np.array([0.0, np.nan]), 0.0)),
 ]
-NOT_FINITE = [(math.nan, 0.0), (0.0, math.inf), (np.array([0.0, np.nan]), 0.0)]
 
 
-@pytest.mark.parametrize('limits', [FREE, LIMITS], ids=['free', 'limited'])
-@pytest.mark.parametrize('twist', NO_TWISTS + NOT_FINITE, ids=str)
-def test_a_law_that_gives_something_else_is_named(twist, limits):
-    with pytest.raises(ValueError, match=r'^law must .*got'):
-        closed_loops(lambda pose, to: twist, np.zeros((2, 3)), [1.0, 0.0], limits=limits)
-
-
-# --- Arrays of limits, bad input
-
-
-def test_limits_as_arrays_are_limits_one_by_one():
-    rng = np.random.default_rng(11)
-    v, omega = rng.choice([-1.0, 1.0], (2, 500)) * 10.0 ** rng.uniform(-3.0, 2.0, (2, 500))
-    drawn = 10.0 ** rng.uniform(-2.0, 1.0, (5, 500)) * [[-1.0], [1.0], [-1.0], [1.0], [10.0]]
-    drawn[:, ::7], drawn[:4, ::5] = [[-np.inf], [np.inf], [-np.inf], [np.inf], [np.inf]], 0.0
-    names = VelocityLimits.names()
-    limited = saturate(v, omega, VelocityLimits(**dict(zip(names, drawn, strict=True))), R, L)
-    ones = [
-        saturate(*twist, VelocityLimits(**dict(zip(names, map(float, row), strict=True))), R, L)
-        for *twist, row in zip(v, omega, drawn.T, strict=True)
-    ]
-    assert np.array_equal(np.transpose(limited), ones)
-
-
-@pytest.mark.parametrize('bad', [[0.5, -0.5], np.array([0.1, np.nan]), 'fast', None, 1j], ids=str)
-@pytest.mark.parametrize('name', VelocityLimits.names())
-def test_a_bad_limit_is_named(name, bad):
-    with pytest.raises(ValueError, match=rf'^{name} must be'):
-        VelocityLimits(**{name: bad})
-
-
-@pytest.mark.parametrize('names', [(), ('max_v',), ('max_wheel_speed',)], ids=str)
-def test_twists_and_limits_that_do_not_broadcast_are_named(names):
-    limits = VelocityLimits(**dict.fromkeys(names, np.ones(2)))
-    with pytest.raises(ValueError, match=r'must have leading axes that broadcast, got .*\(3,\).*\(2,\)'):
-        saturate(np.ones(3), 1.0 if names else np.ones(2), limits, R, L)
-
-
-@pytest.mark.parametrize('bad', [math.nan, math.inf, 'near', 1j], ids=str)
-@pytest.mark.parametrize('name', ['xy_tolerance', 'yaw_tolerance', 'offset'])
-def test_a_bad_arrival_is_named(name, bad):
-    with pytest.raises(ValueError, match=rf'^{name} must be'):
-        Arrival(**{name: bad})
+def test_a_law_that_returns_something_else_is_named():
+    for twist, limits in itertools.product(NO_TWISTS, (FREE, LIMITS)):
+        with pytest.raises(ValueError, match=r'^law must .*got'):
+            closed_loops(lambda *_, twist=twist: twist, np.zeros((2, 3)), [1.0, 0.0], limits=limits)
 
 
 BAD = {
@@ -444,19 +326,21 @@ BAD = {
 
 
 @pytest.mark.parametrize('drive', [closed_loops, trajectories])
-@pytest.mark.parametrize(
-    ('name', 'bad'), [(name, bad) for name, row in BAD.items() for bad in row], ids=str
-)
-def test_invalid_arguments_are_named(drive, name, bad):
-    arguments = {'starts': np.zeros((2, 3)), 'goals': [1.0, 0.0], 'gain 1': 0.5}
-    if name in arguments:
-        arguments[name], options = bad, {}
-    elif name == 'max_v':
-        options = {'limits': VelocityLimits(max_v=bad)}
-    else:
-        options = {'arrival': Arrival(offset=bad)} if name == 'offset' else {name: bad}
-    with pytest.raises(ValueError, match=rf'\b{name}\b.* must .*got'):
-        drive(go_to_goal, arguments['starts'], arguments['goals'], 3.0, arguments['gain 1'], **options)
+@pytest.mark.parametrize('name', BAD)
+def test_invalid_arguments_are_named(drive, name):
+    for bad in BAD[name]:
+        batch = {'starts': np.zeros((2, 3)), 'goals': [1.0, 0.0], 'gain 1': 0.5}
+        options = {}
+        if name in batch:
+            batch[name] = bad
+        elif name == 'max_v':
+            options['limits'] = VelocityLimits(max_v=bad)
+        elif name == 'offset':
+            options['arrival'] = Arrival(offset=bad)
+        else:
+            options[name] = bad
+        with pytest.raises(ValueError, match=rf'\b{name}\b.* must .*got'):
+            drive(go_to_goal, batch['starts'], batch['goals'], 3.0, batch['gain 1'], **options)
 
 
 def test_headings_that_count_must_be_given():
@@ -482,20 +366,27 @@ FOLLOWING = {
     'lag': Actuators(lag=0.08),
     'all': Actuators(acceleration=SLOW, lag=0.02, delay=33 * MS),
 }
+AT_REST = {'trans_stopped_velocity': 0.01, 'rot_stopped_velocity': 0.05}
 
 
-@pytest.mark.parametrize('stops', [False, True], ids=['any speed', 'at rest'])
-@pytest.mark.parametrize('name', LAWS)
-@pytest.mark.parametrize('following', FOLLOWING)
-def test_robots_that_take_time_drive_as_one_alone(following, name, stops):
+@pytest.mark.parametrize(
+    ('following', 'name', 'stops'),
+    [
+        (None, 'pose', {}),
+        ('limits', 'go_to_goal', {}),
+        ('limits', 'pose', AT_REST),
+        ('wheels', 'offset_point', AT_REST),
+        ('lag', 'pose', {}),
+        ('all', 'go_to_goal', AT_REST),
+        ('all', 'offset_point', {}),
+    ],
+)
+def test_robots_drive_as_one_of_the_nodes_alone(following, name, stops):
     law, gains = LAWS[name]
     starts, targets = random_batch(7, 2)
-    arrival = Arrival(
-        use_heading=name == 'pose',
-        offset=gains[1] if name == 'offset_point' else 0.0,
-        **({'trans_stopped_velocity': 0.01, 'rot_stopped_velocity': 0.05} if stops else {}),
-    )
-    actuators = FOLLOWING[following]
+    offset = gains[1] if name == 'offset_point' else 0.0
+    arrival = Arrival(use_heading=name == 'pose', offset=offset, **stops)
+    actuators = FOLLOWING.get(following)
     many = {'duration': 5.0, 'arrival': arrival, 'limits': LIMITS, 'actuators': actuators}
     gone = trajectories(law, starts, targets, *gains, **many)
     assert_same(closed_loops(law, starts, targets, *gains, **many), gone.outcomes)

@@ -68,11 +68,11 @@ def test_a_law_with_three_gains_drives_to_a_pose(lockstep):
     lockstep.add(make(VirtualRobot))
     node = lockstep.add(GoToGoal(controller=POLAR))
     assert change(node, k_alpha=4.0, k_rho=1.0, k_beta=-1.0).successful
-    lockstep.publish('goal_pose', goal(-0.8, 0.5, 1.0))
+    lockstep.publish('goal_pose', goal(-0.4, 0.2, 1.0))
     arrives(lockstep, topics)
     assert topics.statuses[-1] == SUCCEEDED
     x, y, theta = pose_of(topics.odom[-1])
-    assert math.dist((x, y), (-0.8, 0.5)) < 0.021
+    assert math.dist((x, y), (-0.4, 0.2)) < 0.021
     assert abs(theta - 1.0) < 0.021
 
 
@@ -82,13 +82,8 @@ def test_gains_of_an_installed_controller_are_parameters_from_the_start(lockstep
     assert node.get_parameter('k_beta').value == -0.5
     (described,) = node.describe_parameters(['k_beta'])
     assert described.description == 'Gain on the heading [1/s].'
-    assert (
-        described.floating_point_range[0].from_value,
-        described.floating_point_range[0].to_value,
-    ) == (
-        -20.0,
-        0.0,
-    )
+    (limits,) = described.floating_point_range
+    assert (limits.from_value, limits.to_value) == (-20.0, 0.0)
     result = change(node, k_beta=1.0)
     assert not result.successful
     assert 'k_beta' in result.reason
@@ -115,22 +110,17 @@ def test_the_default_of_a_shared_gain_is_that_of_the_controller_chosen():
     assert GoToGoalParameters().kp == 3.0
 
 
-@pytest.mark.parametrize(
-    'name', ['odom_timeout', 'limits', 'check', 'extended', 'linear_x_max_velocity', 'use_sim_time']
-)
-def test_a_gain_cannot_take_a_name_that_the_node_uses(lockstep, name):
-    taken = replace(POLAR, gains=(Gain(name=name, default=1.0), *POLAR.gains[1:]))
-    with pytest.raises(ParameterError, match=f"has a gain '{name}', a name that go_to_goal uses"):
-        GoToGoal(controller=taken)
-
-
-def test_gains_of_one_name_have_one_range(lockstep):
+def test_a_gain_cannot_take_a_name_that_the_node_uses_or_another_range(lockstep):
     """The parameter keeps its range when the controller is changed."""
+    used = ('odom_timeout', 'limits', 'check', 'extended', 'linear_x_max_velocity', 'use_sim_time')
+    refused = [(Gain(name=one, default=1.0), f"'{one}', a name that go_to_goal uses") for one in used]
     for gain in (
         Gain(name='kp', default=-2.0, bounds=(-10.0, 0.0)),
         Gain(name='offset', default=0.1, unit='m', bounds=(-1.0, 1.0)),
     ):
-        with pytest.raises(ParameterError, match='with another unit or other bounds'):
+        refused.append((gain, 'with another unit or other bounds'))
+    for gain, words in refused:
+        with pytest.raises(ParameterError, match=words):
             GoToGoal(controller=replace(POLAR, gains=(gain, *POLAR.gains[1:])))
 
 
@@ -159,26 +149,23 @@ def test_the_page_offers_the_gains_of_the_controller(install):
 # --- Sweeps
 
 
+@pytest.mark.slow
 def test_three_gains_are_swept_two_at_a_time(install, tmp_path, monkeypatch, capsys):
-    setup = SweepSetup(controller=POLAR, gains={'k_alpha': (1.5, 3.0), 'k_beta': -0.3}, grid=3, starts=4)
+    gains = {'k_alpha': (1.5, 3.0), 'k_beta': -0.3}
+    setup = SweepSetup(controller=POLAR, gains=gains, grid=3, starts=2, rate=10.0)
     assert [gain.name for gain in setup.axes] == ['k_rho', 'k_alpha']
     swept = sweep(setup)
     # 0.05/s is too slow for a minute.
     assert swept.complete.tolist() == [[False, True, True]] * 3
     header, *rows = sweep_table(swept).splitlines()
     assert header.startswith('k_rho_per_s,k_alpha_per_s,starts,arrived,time_mean_s,')
-    assert rows[3].startswith('0.775,1.5,4,4,')
-    alone = closed_loops(
-        POLAR,
-        setup.poses(),
-        np.zeros(3),
-        *(0.775, 1.5, -0.3),
-        arrival=setup.arrival,
-    )
+    assert rows[3].startswith('0.775,1.5,2,2,')
+    how = {'arrival': setup.arrival, 'rate': 10.0}
+    alone = closed_loops(POLAR, setup.poses(), np.zeros(3), 0.775, 1.5, -0.3, **how)
     np.testing.assert_array_equal(alone.time, swept.outcomes.time[0, 1])
     monkeypatch.chdir(tmp_path)
     arguments = ['--controller', install('polar'), '--k_beta', ' -0.8', ' -0.2', '--k_rho', '0.5']
-    small = ['--grid', '2', '--starts', '2', '--csv', 'a.csv', '-o', 'a.png']
+    small = ['--grid', '2', '--starts', '2', '--rate', '10', '--csv', 'a.csv', '-o', 'a.png']
     assert sweep_gains.main([*arguments, *small], Signals()) == 0
     assert (tmp_path / 'a.csv').read_text().startswith('k_alpha_per_s,k_beta_per_s,')
     assert 'fastest: k_alpha' in capsys.readouterr().out
@@ -219,20 +206,19 @@ def test_the_integral_removes_a_bias_in_node_and_batch_alike():
 
         return replace(controller, law=law)
 
-    without = replace(INTEGRAL, gains=INTEGRAL.gains)
     ends = []
     for ki in (0.0, 2.0):
-        bound = biased(without).bind(SimpleNamespace(kp=2.0, kv=0.0, ki=ki))
-        theta, batch = 0.3, []
-        for step in range(500):
+        bound = biased(INTEGRAL).bind(SimpleNamespace(kp=2.0, kv=0.0, ki=ki))
+        theta = 0.3
+        for step in range(250):
             bound.now = step * 20_000_000
             _, omega = bound((0.0, 0.0, theta), (1.0, 0.0, 0.0))
             theta += omega * 0.02
         ends.append(theta)
-        batch = closed_loops(biased(without), [[0.0, 0.0, 0.3]], [1.0, 0.0], 2.0, 0.0, ki, duration=10.0)
+        batch = closed_loops(biased(INTEGRAL), [[0.0, 0.0, 0.3]], [1.0, 0.0], 2.0, 0.0, ki, duration=5.0)
         assert batch.pose[0, 2] == pytest.approx(theta, abs=1e-12)
-    assert ends[0] == pytest.approx(-0.5, abs=1e-3)
-    assert abs(ends[1]) < 1e-3
+    assert ends[0] == pytest.approx(-0.5, abs=2e-3)
+    assert abs(ends[1]) < 2e-2
 
 
 def test_robots_of_a_batch_have_states_of_their_own():
@@ -260,18 +246,15 @@ def test_an_equation_may_have_a_state_too():
     assert ended.pose[:, 2] == pytest.approx([0.1 * 2.0 * (1.0 + 1.0 + 1.1)] * 2)
 
 
-@pytest.mark.parametrize(
-    ('result', 'words'),
-    [
-        ((0.0, 0.0), 'must return (v, omega), two numbers, and the state, shape (1,), got (0.0, 0.0)'),
+def test_an_invalid_state_is_named():
+    for result, words in (
+        ((0.0, 0.0), 'two numbers, and the state, shape (1,), got (0.0, 0.0)'),
         ((0.0, 0.0, [1.0, 2.0]), 'and the state, shape (1,)'),
         ((0.0, 0.0, [math.nan]), 'must return finite (v, omega), got (0, 0) and the state [nan]'),
-    ],
-)
-def test_an_invalid_state_is_named(result, words):
-    own = replace(INTEGRAL, law=lambda *given, state, dt: result)
-    with pytest.raises(LawError, match=re.escape(words)):
-        own.bind(SimpleNamespace(kp=1.0, kv=1.0, ki=1.0))(np.zeros(3), np.ones(3))
+    ):
+        own = replace(INTEGRAL, law=lambda *_, result=result, **__: result)
+        with pytest.raises(LawError, match=re.escape(words)):
+            own.bind(SimpleNamespace(kp=1.0, kv=1.0, ki=1.0))(np.zeros(3), np.ones(3))
 
 
 def test_time_that_goes_back_is_no_time():
@@ -306,9 +289,9 @@ def test_gains_named_as_options_are_swept_under_another_name(capsys, monkeypatch
     assert 'fastest: grid 0.6, max_velocity' in capsys.readouterr().out
 
 
-@pytest.mark.parametrize('bad', ['x', None, (1.0,), [1.0, 2.0, 3.0], 1j, math.nan], ids=str)
-def test_gains_of_a_setup_are_numbers_or_ranges(bad):
-    with pytest.raises(ValueError, match='kp must be'):
-        SweepSetup(gains={'kp': bad})
+def test_gains_of_a_setup_are_numbers_or_ranges():
+    for bad in ('x', None, (1.0,), [1.0, 2.0, 3.0], 1j, math.nan):
+        with pytest.raises(ValueError, match='kp must be'):
+            SweepSetup(gains={'kp': bad})
     with pytest.raises(ValueError, match='gains must be of class Mapping'):
         SweepSetup(gains=[('kp', 1.0)])

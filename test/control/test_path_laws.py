@@ -24,7 +24,7 @@ from diffdrive_jacobian.kinematics import diff_drive, se2
 from diffdrive_jacobian.simulation import Drift, RobotModel, follow_path
 
 RNG = np.random.default_rng(33)
-COUNT = 200
+COUNT = 100
 DT = 1e-4
 V_R, OMEGA_R = 0.3, 0.4
 """A reference on a circle."""
@@ -78,17 +78,17 @@ def test_kanayama_s_function_decreases_as_it_was_proved():
     assert proved.max() <= 0.0
     # And over a drive.
     before = lyapunov(robot, reference)
-    for _ in range(300):
+    for _ in range(200):
         v, omega = kanayama(robot, references(reference), k_x, k_y, k_theta)
         robot, reference = driven(robot, v, omega, 1e-2), circling(reference, 1e-2)
         after = lyapunov(robot, reference)
         assert (after <= before + 1e-3).all()
         before = after
-    assert np.median(before) < 1e-2
+    assert np.median(before) < 3e-2
 
 
-@pytest.mark.parametrize('d', [0.1, -0.2])
-def test_the_error_of_the_offset_point_decays_exponentially(d):
+def test_the_error_of_the_offset_point_decays_exponentially():
+    d = np.where(np.arange(COUNT) % 2, 0.1, -0.2)
     k, robot, reference = 2.0, poses(), poses()
 
     def error(robot, reference):
@@ -103,7 +103,7 @@ def test_the_error_of_the_offset_point_decays_exponentially(d):
 
 def test_dynamic_feedback_makes_the_error_linear():
     """e_ddot + K_d e_dot + K_p e = 0, here with the solution e(t) = exp(A t) e(0)."""
-    k_p, k_d, dt, steps = 4.0, 4.0, 1e-4, 5000
+    k_p, k_d, dt, steps = 4.0, 4.0, 1e-3, 500
     reference = poses(20)
     # Near enough that the speed stays positive.
     robot = se2.compose(reference, RNG.uniform(-0.05, 0.05, (20, 3)))
@@ -125,7 +125,7 @@ def test_dynamic_feedback_makes_the_error_linear():
     # Critically damped with the rate 2.
     t = steps * dt
     expected = math.exp(-2.0 * t) * (first[:, :2] * (1.0 + 2.0 * t) + first[:, 2:] * t)
-    assert abs(error(robot, xi, reference)[:, :2] - expected).max() < 1e-4
+    assert abs(error(robot, xi, reference)[:, :2] - expected).max() < 1e-3
     assert abs(first[:, :2]).max() > 0.04
 
 
@@ -187,31 +187,27 @@ def test_commutes_with_motions_of_the_plane_and_with_a_mirror(controller):
 # --- Robots that follow
 
 
-def eight(count=200):
+def eight(count=60):
     angles = np.linspace(0.0, math.tau, count + 1)
     return Path(np.stack([np.sin(angles), np.sin(angles) * np.cos(angles)], axis=-1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('controller', PATH_CONTROLLERS, ids=lambda one: one.name)
-def test_follows_a_figure_eight_through_its_crossing(controller):
+def test_follows_a_figure_eight_and_recovers_from_slip_when_it_is_localised(controller):
     path = eight()
     result = follow_path(controller, path)
     assert result.finished
-    # It drives the whole of it, not from one branch to the other.
+    # It drives the whole of it, through the crossing, not from one branch to the other.
     assert result.times[-1] == pytest.approx(path.length / 0.2, rel=0.02)
     # Pure pursuit cuts corners.
-    most = 0.015 if controller is PURE_PURSUIT else 1e-3
+    most = 0.015 if controller is PURE_PURSUIT else 2e-3
     assert abs(result.errors[:, 1]).max() < most
-
-
-@pytest.mark.parametrize('controller', PATH_CONTROLLERS, ids=lambda one: one.name)
-def test_recovers_from_slip_when_it_is_localised(controller):
-    model = RobotModel(wheel_travel_variance=1e-4, drift=Drift(seed=1))
-    path = eight()
-    trajectory = Path(path.poses, path.arc_lengths / 0.2)
-    result = follow_path(controller, trajectory, model=model, localised=True)
-    assert 1e-3 < abs(result.errors[:, :2]).max() < 0.03
-    assert not np.array_equal(result.errors, follow_path(controller, trajectory, model=model).errors)
+    trajectory = Path(path.poses, path.arc_lengths / 0.4)
+    slips = {'model': RobotModel(wheel_travel_variance=1e-4, drift=Drift(seed=1))}
+    localised = follow_path(controller, trajectory, **slips, localised=True).errors
+    assert 1e-3 < abs(localised[:, :2]).max() < 0.05
+    assert not np.array_equal(localised, follow_path(controller, trajectory, **slips).errors)
 
 
 def test_the_look_ahead_point_is_beyond_the_end_of_an_open_path():
@@ -223,22 +219,19 @@ def test_the_look_ahead_point_is_beyond_the_end_of_an_open_path():
     assert omega == pytest.approx(2.0 * v * -0.05 / 0.2**2, rel=1e-2)
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        ({'controller': 'kanayama'}, 'controller must be of class PathController'),
-        ({'path': [[0, 0], [1, 0]]}, 'path must be of class Path'),
-        ({'rate': 0.0}, 'rate must be positive'),
-        ({'gains': {'k_y': math.nan}}, 'k_y must be in'),
-        ({'gains': {'kp': 1.0}}, 'gains must be among k_x, k_y, k_theta, got kp'),
-    ],
-)
-def test_follow_path_says_what_is_wrong(arguments, words):
-    with pytest.raises(ValueError, match=words):
-        follow_path(**{'controller': KANAYAMA, 'path': eight(), **arguments})
+BAD = [
+    ({'controller': 'kanayama'}, 'controller must be of class PathController'),
+    ({'path': [[0, 0], [1, 0]]}, 'path must be of class Path'),
+    ({'rate': 0.0}, 'rate must be positive'),
+    ({'gains': {'k_y': math.nan}}, 'k_y must be in'),
+    ({'gains': {'kp': 1.0}}, 'gains must be among k_x, k_y, k_theta, got kp'),
+]
 
 
-def test_a_look_ahead_must_be_a_gain():
+def test_invalid_arguments_are_named():
+    for arguments, words in BAD:
+        with pytest.raises(ValueError, match=words):
+            follow_path(**{'controller': KANAYAMA, 'path': eight(), **arguments})
     with pytest.raises(ValueError, match="lookahead must be '' or one of kp, kv, got 'l'"):
         PathController(name='mine', law=lambda *_: (0.0, 0.0), lookahead='l')
     assert DYNAMIC_FEEDBACK.lookahead_distance(DYNAMIC_FEEDBACK.defaults) == 0.0

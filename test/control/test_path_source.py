@@ -40,27 +40,24 @@ def test_a_figure_eight():
     assert_allclose(crossings[:, :2], [[0.0, 1.0]] * 2, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ('name', 'content'),
-    [
-        ('a.csv', 'x,y,theta,t\n0,1,0.5,3\n2,3,0.25,4\n'),
-        ('a.csv', '# mine\n\nt, y, x, theta\r\n3,1,0,0.5\r\n4,3,2,0.25\r\n'),
-        ('a.csv', '0,1,0.5,3\n2,3,0.25,4'),
-        ('a.csv', '\ufefftime_s,x_m,y_m,theta_rad,v_mps\n3,0,1,0.5,\n4,2,3,0.25,1\n'),
-        ('a.yaml', '[[0, 1, 0.5, 3], [2, 3, 0.25, 4]]'),
-        ('a.yml', 'poses:\n- {x: 0, y: 1, theta: 0.5, t: 3}\n- {t: 4, x: 2, y: 3, theta: 0.25}\n'),
-    ],
-)
-def test_files(tmp_path, name, content):
-    (tmp_path / name).write_text(content)
-    path = planned_path(str(tmp_path / name))
-    assert path.poses.tolist() == [[0.0, 1.0, 0.5], [2.0, 3.0, 0.25]]
-    assert path.times.tolist() == [0.0, 1.0]
+FILES = [
+    ('a.csv', 'x,y,theta,t\n0,1,0.5,3\n2,3,0.25,4\n'),
+    ('a.csv', '# mine\n\nt, y, x, theta\r\n3,1,0,0.5\r\n4,3,2,0.25\r\n'),
+    ('a.csv', '0,1,0.5,3\n2,3,0.25,4'),
+    ('a.csv', '\ufefftime_s,x_m,y_m,theta_rad,v_mps\n3,0,1,0.5,\n4,2,3,0.25,1\n'),
+    ('a.yaml', '[[0, 1, 0.5, 3], [2, 3, 0.25, 4]]'),
+    ('a.yml', 'poses:\n- {x: 0, y: 1, theta: 0.5, t: 3}\n- {t: 4, x: 2, y: 3, theta: 0.25}\n'),
+]
 
 
-def test_a_file_of_positions(tmp_path):
-    (tmp_path / 'a.csv').write_text('x,y\n0,0\n1,0\n')
-    path = planned_path(str(tmp_path / 'a.csv'))
+def test_files(tmp_path):
+    for name, content in FILES:
+        (tmp_path / name).write_text(content)
+        path = planned_path(str(tmp_path / name))
+        assert path.poses.tolist() == [[0.0, 1.0, 0.5], [2.0, 3.0, 0.25]], content
+        assert path.times.tolist() == [0.0, 1.0], content
+    (tmp_path / 'b.csv').write_text('x,y\n0,0\n1,0\n')
+    path = planned_path(str(tmp_path / 'b.csv'))
     assert path.poses.tolist() == [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
     assert path.times is None
 
@@ -108,19 +105,13 @@ def test_bad_files(tmp_path, name, content, message):
         planned_path(str(tmp_path / name))
 
 
-@pytest.mark.parametrize('text', ['circle:0', 'circle:-1', 'eight:nan', 'line:inf', 'line:a'])
-def test_bad_sizes(text):
-    with pytest.raises(PathError, match=f"size of a shape must be a positive number .m., got '{text}'"):
-        planned_path(text)
-
-
-@pytest.mark.parametrize('text', ['circle', 'line:'])
-def test_sizes_are_needed(text):
-    with pytest.raises(PathError, match=f"{text.strip(':')} needs its size .m., as in .*, got '{text}'"):
-        planned_path(text)
-
-
-def test_what_is_no_file(tmp_path):
+def test_texts_that_are_neither_a_shape_nor_a_file(tmp_path):
+    for text in ('circle:0', 'circle:-1', 'eight:nan', 'line:inf', 'line:a'):
+        with pytest.raises(PathError, match=f"shape must be a positive number .m., got '{text}'"):
+            planned_path(text)
+    for text in ('circle', 'line:'):
+        with pytest.raises(PathError, match=f"{text.strip(':')} needs its size .m., as in .*'{text}'"):
+            planned_path(text)
     for text in (str(tmp_path / 'missing.csv'), str(tmp_path) + '.csv', 'a\0b.csv'):
         with pytest.raises(PathError):
             planned_path(text)

@@ -14,12 +14,10 @@ import pytest
 from support.lockstep_nodes import Controller, change
 from support.ros_messages import goal
 
-from diffdrive_jacobian.control import find_controller, go_to_goal, go_to_pose
+from diffdrive_jacobian.control import find_controller, go_to_pose
 from diffdrive_jacobian.control.sampling import rate_warning, without_whole_turns
-from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.simulation import closed_loops
 
-LAWS = ['turn in place', 'go_to_goal', 'pose', 'offset_point']
 TOO_FAST = 'not below the odometry rate'
 
 
@@ -32,23 +30,21 @@ def arrived(monkeypatch):
     return sampled_laws.arrived
 
 
-@pytest.mark.parametrize('law', LAWS)
-@pytest.mark.parametrize('delay', [0.0, 1.0, None], ids=['none', 'one', 'up to one'])
-def test_within_the_bound_every_robot_arrives(arrived, law, delay):
-    assert arrived(law, 1.0, delay, 60).all()
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ('law', 'factor', 'delay'),
+    ('law', 'beyond', 'late'),
     [
         ('turn in place', 1.1, 0.0),
         ('go_to_goal', 1.1, 1.0),
         ('pose', 1.5, 1.0),
-        ('offset_point', 2, 1.0),
+        ('offset_point', 2.0, 1.0),
     ],
 )
-def test_beyond_the_bound_robots_do_not_arrive(arrived, law, factor, delay):
-    assert arrived(law, factor, delay, 20).mean() < 0.8
+def test_robots_arrive_within_the_bound_and_not_beyond(arrived, law, beyond, late):
+    # Without delay, with that of a sample, with a random one.
+    for delay in (0.0, 1.0, None):
+        assert arrived(law, 1.0, delay, 12).all(), delay
+    assert arrived(law, beyond, late, 20).mean() < 0.8
 
 
 @pytest.mark.parametrize(('kp', 'kv'), [(3.0, 0.5), (2.0, 0.5), (10.0, 0.1)])
@@ -68,43 +64,6 @@ def test_the_slope_is_the_largest_that_the_yaw_rate_has_over_the_heading(name, k
     assert stated <= largest + (kv if name == 'go_to_goal' else 0.15 * stated)
 
 
-def radius(law, target, T, *gains):
-    """Return the spectral radius of a period in bearing and heading, linearized at the goal."""
-
-    def after(alpha, phi):
-        pose = (-math.cos(phi), -math.sin(phi), phi - alpha)
-        pose = se2.integrate(pose, law(pose, target, *gains), T)
-        phi = math.atan2(-pose[1], -pose[0])
-        return phi - pose[2], phi
-
-    small = 1e-7
-    step = np.array([after(small, 0.0), after(0.0, small)]).T / small
-    if len(target) == 2:
-        return abs(step[0, 0])
-    return np.abs(np.linalg.eigvals(step)).max()
-
-
-@pytest.mark.parametrize('T', [0.1, 0.02])
-@pytest.mark.parametrize('b', [0.02, 0.3, 0.7])
-def test_the_linearized_conditions_are_exact(T, b):
-    Kv = b / T
-    for Kp in (Kv / (1.0 - b / 2.0), 2.0 / T):
-        inside = 0.99 if Kp == 2.0 / T else 1.01
-        assert radius(go_to_goal, (0.0, 0.0), T, Kp * inside, Kv) < 1.0
-        assert radius(go_to_goal, (0.0, 0.0), T, Kp * (2.0 - inside), Kv) > 1.0
-    for a in (0.5, 1.0):
-        Kp = a / T
-        h = (2.0 - b) * a / b**2 - 1.0
-        if h > 0.0:
-            assert radius(go_to_pose, (0.0, 0.0, 0.0), T, Kp, Kv, 0.98 * h) < 1.0
-            assert radius(go_to_pose, (0.0, 0.0, 0.0), T, Kp, Kv, 1.02 * h) > 1.0
-    assert radius(go_to_pose, (0.0, 0.0, 0.0), T, (1.98 - b) / T, Kv, 1e-3) < 1.0
-    assert radius(go_to_pose, (0.0, 0.0, 0.0), T, (2.02 - b) / T, Kv, 1e-3) > 1.0
-
-
-# --- Whole turns
-
-
 def test_without_whole_turns_the_next_heading_is_the_same():
     omega, rate = np.random.default_rng(1).uniform(-1000.0, 1000.0, 1000), 50.0
     found = without_whole_turns(omega, rate)
@@ -115,17 +74,17 @@ def test_without_whole_turns_the_next_heading_is_the_same():
     assert without_whole_turns(314.0, rate) == pytest.approx(314.0 - math.tau * rate)
 
 
-@pytest.mark.parametrize('h', [100.0, 125.0, 215.0])
-def test_a_weight_with_which_it_would_turn_once_per_sample_for_ever_arrives(h):
-    starts = np.random.default_rng(2).uniform([-3.0, -3.0, -3.0], 3.0, (200, 3))
+def test_weights_with_which_it_would_turn_once_per_sample_for_ever_arrive():
+    starts = np.random.default_rng(2).uniform([-3.0, -3.0, -3.0], 3.0, (30, 3))
     starts[0] = 2.6080, 1.8942, 2.0064
+    h = np.array([[100.0], [125.0], [215.0]])
     assert closed_loops(go_to_pose, starts, [0.0, 0.0, 0.0], 5.0, 1.0, h).arrived.all()
 
 
-# --- Warnings
+# --- Warnings of the node
 
 
-def drive(lockstep, controller, period, messages=12, start=0.0):
+def drive(lockstep, controller, period, messages, start=0.0):
     """Send odometry of a robot that does not move, at that period."""
     for _ in range(messages):
         command = controller.at(0.0, 0.0, start)
@@ -133,11 +92,9 @@ def drive(lockstep, controller, period, messages=12, start=0.0):
     return command
 
 
-@pytest.mark.parametrize(('slope', 'words'), [(49.9, ''), (50.1, 'never arrive')])
-def test_the_bound_for_commands_up_to_one_sample_late_is_warned_about(slope, words):
-    warning = rate_warning(slope, 50.0)
-    assert words in warning
-    assert bool(warning) == bool(words)
+def test_the_bound_for_commands_up_to_one_sample_late_is_warned_about():
+    assert rate_warning(49.9, 50.0) == ''
+    assert 'never arrive' in rate_warning(50.1, 50.0)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +102,6 @@ def test_the_bound_for_commands_up_to_one_sample_late_is_warned_about(slope, wor
     [
         ({'kp': 45.0}, 0.02, False),
         ({'kp': 55.0}, 0.02, True),
-        ({'kp': 3.0}, 0.1, False),
         ({'kp': 3.0}, 1 / 1.4, True),
         ({'kp': 3.0, 'controller': 'pose'}, 0.02, False),
         ({'kp': 10.0, 'controller': 'pose'}, 0.02, True),
@@ -159,16 +115,16 @@ def test_gains_too_large_for_the_rate_are_warned_about_once(lockstep, capfd, par
     controller.send(goal(5, 0))
     drive(lockstep, controller, period, 10)
     assert TOO_FAST not in capfd.readouterr().err
-    drive(lockstep, controller, period, 30)
+    drive(lockstep, controller, period, 12)
     controller.send(goal(4, 0))
-    drive(lockstep, controller, period)
+    drive(lockstep, controller, period, 12)
     assert capfd.readouterr().err.count(TOO_FAST) == warned
 
 
 def test_gains_that_become_too_large_are_warned_about(lockstep, capfd):
     controller = Controller(lockstep, kp=3.0)
     controller.send(goal(5, 0))
-    drive(lockstep, controller, 0.05)
+    drive(lockstep, controller, 0.05, 12)
     assert TOO_FAST not in capfd.readouterr().err
     assert change(controller.node, kp=25.0).successful
     assert 'rate of 20 Hz' in capfd.readouterr().err
@@ -177,16 +133,16 @@ def test_gains_that_become_too_large_are_warned_about(lockstep, capfd):
 def test_the_node_makes_no_whole_turns(lockstep):
     controller = Controller(lockstep, kp=40.0, odom_timeout=0.0)
     controller.send(goal(-5, 1))
-    _, omega = drive(lockstep, controller, 0.1)
+    _, omega = drive(lockstep, controller, 0.1, 12)
     wanted = 40.0 * math.atan2(1.0, -5.0)
     assert wanted > 7.0 / 8.0 * math.tau * 10.0
     assert omega == pytest.approx(math.remainder(wanted / 10.0, math.tau) * 10.0)
 
 
-@pytest.mark.parametrize(
-    ('limit', 'words'), [(0.0, 'not at all'), (0.05, 'more than 60 s'), (0.06, None)]
-)
-def test_a_yaw_rate_that_is_limited_too_much_is_warned_about(lockstep, capfd, limit, words):
-    Controller(lockstep, angular__z__max_velocity=limit)
-    said = capfd.readouterr().err
-    assert words in said if words else 'yaw rate is limited' not in said
+def test_a_yaw_rate_that_is_limited_too_much_is_warned_about(lockstep, capfd):
+    node = Controller(lockstep).node
+    for limit, words in ((0.0, 'not at all'), (0.05, 'more than 60 s')):
+        assert change(node, angular__z__max_velocity=limit).successful
+        assert words in capfd.readouterr().err
+    assert change(node, angular__z__max_velocity=0.06).successful
+    assert 'yaw rate is limited' not in capfd.readouterr().err

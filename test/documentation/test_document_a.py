@@ -39,6 +39,7 @@ def test_the_adjugate_takes_nine_operations_and_its_check_ten():
     assert operations(function) == 9 + 10
 
 
+@pytest.mark.slow
 def test_saturated_actuators_do_not_follow():
     # Two lines, beside the hole around the base and through it; actuators without limits and with.
     arm, x = PlanarArm([0.5, 0.4]), np.array([0.11, 0.05])
@@ -121,6 +122,7 @@ def test_the_pseudo_inverse_of_s_stands_still_where_the_law_turns():
     close([v, omega], [0.0, 1.5 * np.pi])
 
 
+@pytest.mark.slow
 def test_null_space_motion_leaves_the_tip_and_keeps_the_arm_away_from_an_obstacle():
     arm = null_space_figure.ARM
     track = null_space_figure.self_motion()

@@ -45,6 +45,8 @@ def section(page, heading):
 # --- Code
 
 
+@pytest.mark.pages
+@pytest.mark.process
 @pytest.mark.parametrize('name', [name for name in PAGES if any(map(is_run, blocks(TEXTS[name])))])
 def test_code_runs_and_prints_what_the_page_quotes(tmp_path, name):
     for quoted, printed in run_page(TEXTS[name], tmp_path):
@@ -70,10 +72,10 @@ def test_few_blocks_are_not_run():
     assert len(skipped) <= MOST_SKIPPED
 
 
-@pytest.mark.parametrize('name', PAGES)
-def test_every_note_belongs_to_a_block(name):
-    notes = re.findall(r'^<!-- (?:test|output)', TEXTS[name], re.MULTILINE)
-    assert len(notes) == sum(len(block.notes) for block in blocks(TEXTS[name]))
+def test_every_note_belongs_to_a_block():
+    for name, text in TEXTS.items():
+        notes = re.findall(r'^<!-- (?:test|output)', text, re.MULTILINE)
+        assert len(notes) == sum(len(block.notes) for block in blocks(text)), name
 
 
 def test_the_first_example_gives_the_numbers_in_its_comments():
@@ -185,11 +187,12 @@ def test_each_item_of_the_documents_is_in_one_table_with_functions_and_tests_tha
     rows = re.findall(r'^\| (\d+) [^|]*\|([^|]*)\|(.*)', text, re.MULTILINE)
     assert [int(number) for number, _, _ in rows] == list(range(1, ITEMS + 1))
     known = {*library(), *plots.__all__, *TOOLS, *NODES}
+    tests = {path.name for path in (ROOT / 'test').rglob('test_*.py')}
     for number, functions, rest in rows:
         for function in re.findall(r'`([\w.]+)', functions):
             assert function.split('.')[-1] in known, (number, function)
         for test in re.findall(r'`(test_\w+\.py)', rest):
-            assert (ROOT / 'test' / test).exists(), (number, test)
+            assert test in tests, (number, test)
 
 
 # --- Nodes and tools
@@ -233,28 +236,20 @@ def options_of(tool):
     return {option for action in parser._actions for option in action.option_strings} - COMMON
 
 
-@pytest.mark.parametrize('tool', TOOLS)
-def test_options_of_the_tools(tool):
-    rows = [row for row in section('doc/tools.md', tool).splitlines() if row.startswith('| `-')]
-    documented = {
-        word
-        for row in rows
-        for text in re.findall(r'`(-[^`]+)`', row.split(' | ')[0])
-        for word in re.findall(r'--?[a-z][a-z-]*', text)
-    }
-    assert documented == options_of(tool)
+def test_options_of_the_tools():
+    for tool in TOOLS:
+        rows = re.findall(r'^\| (`-.*?) \| ', section('doc/tools.md', tool), re.MULTILINE)
+        texts = re.findall(r'`(-[^`]+)`', ' '.join(rows))
+        documented = {word for text in texts for word in re.findall(r'--?[a-z][a-z-]*', text)}
+        assert documented == options_of(tool), tool
 
 
-@pytest.mark.parametrize('name', PAGES)
-def test_options_in_blocks_that_are_not_run(name):
-    for block in blocks(TEXTS[name]):
-        for line in block.code.splitlines() if 'skip' in block.notes else ():
-            words = (
-                line.split('#')[0]
-                .replace('ros2 run diffdrive_jacobian', '')
-                .split('--ros-args')[0]
-                .split()
-            )
+def test_options_in_blocks_that_are_not_run():
+    skipped = [block for text in TEXTS.values() for block in blocks(text) if 'skip' in block.notes]
+    for block in skipped:
+        for line in block.code.splitlines():
+            command = line.split('#')[0].split('--ros-args')[0]
+            words = command.replace('ros2 run diffdrive_jacobian', '').split()
             if words and words[0] in TOOLS:
                 used = {word.split('=')[0] for word in words[1:] if re.match(r'--?[a-z]', word)}
                 assert used <= options_of(words[0]), line
@@ -269,17 +264,15 @@ def anchors(text):
     return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
 
 
-@pytest.mark.parametrize('name', PAGES)
-def test_links_lead_somewhere(name):
-    for target in LINK.findall(re.sub(r'```.*?```', '', TEXTS[name], flags=re.DOTALL)):
-        if target.startswith(('http://', 'https://')):
-            continue
-        file, _, anchor = target.partition('#')
-        path = (PAGES[name].parent / file).resolve() if file else PAGES[name]
-        assert path.is_relative_to(ROOT), target
-        assert path.exists(), target
-        if anchor:
-            assert anchor in anchors(path.read_text()), target
+def test_links_lead_somewhere():
+    for name, text in TEXTS.items():
+        for target in LINK.findall(re.sub(r'```.*?```', '', text, flags=re.DOTALL)):
+            file, _, anchor = target.partition('#')
+            path = (PAGES[name].parent / file).resolve() if file else PAGES[name]
+            if not target.startswith(('http://', 'https://')):
+                assert path.is_relative_to(ROOT), target
+                assert path.exists(), target
+                assert not anchor or anchor in anchors(path.read_text()), target
 
 
 def test_every_page_is_reached_from_the_index():
@@ -299,6 +292,7 @@ def test_design_lists_every_package_and_files_that_exist():
         assert (package / file).exists() or (ROOT / file).exists(), file
 
 
+@pytest.mark.slow
 def test_the_page_of_public_names_is_as_generated():
     """To write it, every public name is imported."""
     assert pages.PAGES['doc/public.md'].read_text() == pages.public_page()

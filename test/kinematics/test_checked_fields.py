@@ -1,17 +1,27 @@
-"""Fields of dataclasses declare their checks in their annotations."""
+"""Values: fields declare their checks in annotations; arrays are compared and cannot be changed."""
 
 from __future__ import annotations
 
 import pickle
 import re
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, FrozenInstanceError, dataclass, field, replace
 from functools import partial
 from typing import Annotated, ClassVar
 
 import numpy as np
 import pytest
 
-from diffdrive_jacobian.numerics.checks import Finite, NotNegative, Positive, Probability
+from diffdrive_jacobian.control import Arrival, StraightLine, VelocityLimits
+from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+from diffdrive_jacobian.numerics.checks import (
+    Finite,
+    NotNegative,
+    Positive,
+    Probability,
+    equal,
+    hashable,
+)
 from diffdrive_jacobian.numerics.fields import (
     Checked,
     Count,
@@ -27,6 +37,7 @@ from diffdrive_jacobian.numerics.fields import (
     optional,
     sequence,
 )
+from diffdrive_jacobian.simulation import RobotModel
 
 
 def even(name: str, value: int) -> int:
@@ -119,36 +130,83 @@ def test_a_name_for_type_checkers_declares_no_check():
 
 
 @pytest.mark.parametrize(
-    ('check', 'valid', 'invalid', 'message'),
+    ('check', 'valid', 'invalid', 'allowed'),
     [
-        (between(0.0, 1.0), (0, 1.0, np.float32(0.5)), -0.1, 'x must be in [0, 1], got -0.1'),
-        (between(0.0, 1.0), (), float('nan'), 'x must be in [0, 1], got nan'),
-        (between(0.0, 1.0), (), True, 'x must be a number, got True'),
-        (between(0.0, 1.0), (), '1', "x must be a number, got '1'"),
-        (between(0.0, 1.0, unit='m'), (), 2, 'x must be in [0, 1] m, got 2'),
-        (between(0.0, 1.0, above=0.0), (1e-300, 1), 0.0, 'x must be in (0, 1], got 0.0'),
-        (between(0.1), (0.1, 1e300), float('inf'), 'x must be finite and at least 0.1, got inf'),
-        (between(0, 9, above=3), (4,), 3, 'x must be in (3, 9], got 3'),
-        (boolean, (True, False), 1, 'x must be True or False, got 1'),
-        (mapping, ({},), [], 'x must be a map, got []'),
-        (sequence, ([],), {}, 'x must be a list, got {}'),
-        (one_of(), (), 'a', "x must be one of (none), got 'a'"),
-        (partial(instance, wanted=int), (1,), 'a', "x must be of class int, got 'a'"),
+        (between(0.0, 1.0), (0, 1.0, np.float32(0.5)), (-0.1, np.nan), 'in [0, 1]'),
+        (between(0.0, 1.0), (), (True, '1'), 'a number'),
+        (between(0.0, 1.0, unit='m'), (), (2,), 'in [0, 1] m'),
+        (between(0.0, 1.0, above=0.0), (1e-300, 1), (0.0,), 'in (0, 1]'),
+        (between(0.1), (0.1, 1e300), (np.inf, 10**5000), 'finite and at least 0.1'),
+        (between(0, 9, above=3), (4,), (3, 10**5000), 'in (3, 9]'),
+        (boolean, (True, False), (1,), 'True or False'),
+        (mapping, ({},), ([],), 'a map'),
+        (sequence, ([],), ({},), 'a list'),
+        (one_of(), (), ('a',), 'one of (none)'),
+        (partial(instance, wanted=int), (1,), ('a',), 'of class int'),
     ],
 )
-def test_checks_that_need_no_numpy(check, valid, invalid, message):
+def test_checks_that_need_no_numpy(check, valid, invalid, allowed):
     for value in valid:
         assert check('x', value) == value
-    with pytest.raises(ValueError, match=f'^{re.escape(message)}'):
-        check('x', invalid)
-
-
-def test_integers_that_are_no_floats_are_refused():
-    for check in (between(0.0), between(0.0, 9.0)):
-        with pytest.raises(ValueError, match='got an object of class int'):
-            check('x', 10**5000)
+    for value in invalid:
+        got = 'an object of class int' if value == 10**5000 else repr(value)
+        with pytest.raises(ValueError, match=f'^{re.escape(f"x must be {allowed}, got {got}")}$'):
+            check('x', value)
 
 
 def test_ranges_in_words_keep_integers():
     assert interval(0, 2**63 - 1) == 'in [0, 9223372036854775807]'
     assert interval(-1e6, 1e6) == 'in [-1e+06, 1e+06]'
+
+
+# --- Values with arrays
+
+CASES = [(VelocityLimits, 'max_v'), (VelocityLimits, 'max_wheel_speed'), (Arrival, 'offset')]
+
+
+@pytest.mark.parametrize(('cls', 'name'), CASES)
+def test_values_with_arrays_are_equal_where_their_entries_are(cls, name):
+    value = cls(**{name: [0.25, 0.5]})
+    for same in (cls(**{name: (0.25, 0.5)}), cls(**{name: np.array([0.25, 0.5])})):
+        assert value == same
+        assert hash(value) == hash(same)
+    for other in ([0.25, 0.75], [[0.25, 0.5]], [0.25], 0.25):
+        assert value != cls(**{name: other})
+    assert value != 0.25
+    number, array = cls(**{name: 0.25}), cls(**{name: np.array(0.25)})
+    assert (number, hash(number)) == (array, hash(array))
+
+
+def test_signed_zeros_and_nan_are_equal_and_so_are_their_hashes():
+    positive, negative = VelocityLimits(min_v=[0.0, -1.0]), VelocityLimits(min_v=[-0.0, -1.0])
+    assert positive == negative
+    assert hash(positive) == hash(negative)
+    assert equal(np.array([np.nan]), np.array([np.nan]))
+    assert hashable(np.zeros(2)) == hashable(-np.zeros(2))
+
+
+def test_models_are_compared_by_their_limits():
+    assert RobotModel(limits=VelocityLimits(max_v=1.0)) == RobotModel(limits=VelocityLimits(max_v=1.0))
+    assert RobotModel(limits=VelocityLimits(max_v=1.0)) != RobotModel()
+    with pytest.raises(ValueError, match=r'^limits must be numbers for one robot'):
+        RobotModel(limits=VelocityLimits(max_v=[1.0, 2.0]))
+
+
+@pytest.mark.parametrize(
+    ('make', 'name'),
+    [
+        *((cls, name) for cls, name in CASES),
+        (partial(StraightLine, end=[1.0, 0.0], speed=0.1), 'start'),
+        (PlanarArm, 'lengths'),
+        (partial(MobileManipulator, 0.033, 0.16, PlanarArm([0.2])), 'mount'),
+    ],
+)
+def test_a_value_does_not_change_with_the_array_it_was_given(make, name):
+    given = np.array([0.25, 0.5])
+    value = make(**{name: given})
+    given[:] = 7.0
+    assert getattr(value, name).tolist() == [0.25, 0.5]
+    with pytest.raises(ValueError, match='read-only'):
+        getattr(value, name)[0] = 7.0
+    with pytest.raises(FrozenInstanceError):
+        setattr(value, name, given)

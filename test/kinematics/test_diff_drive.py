@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from diffdrive_jacobian.control import go_to_goal
 from diffdrive_jacobian.kinematics import diff_drive as dd
-from diffdrive_jacobian.kinematics import rigid_body, se2
+from diffdrive_jacobian.kinematics import rigid_body
 
-R, L = 0.033, 0.16  # document A's robot
-deterministic = settings(deadline=None, derandomize=True)
+deterministic = settings(deadline=None, derandomize=True, max_examples=50)
 
 headings = st.floats(-np.pi, np.pi)
 dimensions = st.floats(1e-3, 10.0)
 speeds = st.floats(-100.0, 100.0)
+vectors = st.tuples(speeds, speeds, speeds)
 
 
 def close(actual, expected, scale=1.0):
@@ -56,28 +54,6 @@ def test_the_written_out_maps_are_the_matrices_and_undo_each_other(first, second
     close(wheels, J_w_inverse @ vector, np.linalg.norm(J_w_inverse) * 100.0)
     close(dd.body_to_wheel(*body, r, L), vector, np.linalg.cond(J_w) * 100.0)
     close(dd.wheel_to_body(*wheels, r, L), vector, np.linalg.cond(J_w) * 100.0)
-
-
-@deterministic
-@given(headings, st.floats(-9.0, 9.0), st.floats(-9.0, 9.0), st.floats(0.01, 1.0), st.floats(0.05, 2.0))
-def test_jacobians_are_the_derivatives_of_the_motion(theta, x, y, r, L):
-    """Central differences of the exact arc, over small ways and turns and over small wheel angles."""
-    pose, step = np.array([x, y, theta]), 1e-4
-
-    def slope(to_twist, direction):
-        ahead, behind = (se2.integrate(pose, to_twist(h * direction), 1.0) for h in (step, -step))
-        change = ahead - behind
-        return np.append(change[:2], se2.wrap_angle(change[2])) / (2.0 * step)
-
-    J_w = dd.wheel_to_body_jacobian(r, L)
-    for jacobian, to_twist in [
-        (dd.unicycle_jacobian(theta), lambda way_and_turn: way_and_turn),
-        (dd.wheel_to_world_jacobian(theta, r, L), lambda wheel_angles: J_w @ wheel_angles),
-    ]:
-        differences = np.column_stack([slope(to_twist, direction) for direction in np.eye(2)])
-        # The arc's bend enters with the square of the turn, rounding with eps / step.
-        bend = (step * np.abs(jacobian[2]).max()) ** 2 * np.abs(jacobian[:2]).max()
-        np.testing.assert_allclose(differences, jacobian, rtol=1e-12, atol=bend + 1e-14 / step)
 
 
 # --- Constraints
@@ -129,7 +105,7 @@ def test_the_wheel_centres_roll_forward_and_the_axle_centre_is_half_way(theta, r
 
 
 @deterministic
-@given(headings, dimensions, st.tuples(speeds, speeds, speeds))
+@given(headings, dimensions, vectors)
 def test_the_velocities_of_the_wheel_centres_are_those_of_a_rigid_body(theta, L, q_dot):
     """Also of a robot that slips: by differences of the centres, and from one wheel to the other."""
     pose, theta_dot = np.array([0.5, 1.0, theta]), q_dot[2]
@@ -139,9 +115,6 @@ def test_the_velocities_of_the_wheel_centres_are_those_of_a_rigid_body(theta, L,
     (right, left), (v_R, v_L) = dd.wheel_centres(pose, L), velocities
     from_left = rigid_body.point_velocity([*v_L, 0.0], [0.0, 0.0, theta_dot], [*(right - left), 0.0])
     close(from_left, [*v_R, 0.0], 1e3 * (1.0 + L))
-
-
-vectors = st.tuples(speeds, speeds, speeds)
 
 
 @deterministic
@@ -155,75 +128,7 @@ def test_the_velocity_of_a_point_of_a_rigid_body(v, omega, first, second):
     close((at_second - at_first) @ second, 0.0, 1e7)
 
 
-# --- The documents' numbers
-
-
-def test_the_golden_case_of_document_a():
-    state, goal = np.zeros(3), np.ones(2)
-    v, omega = go_to_goal(state, goal, Kp=3.0, Kv=0.5)
-    omega_R, omega_L = dd.body_to_wheel(v, omega, R, L)
-    assert [f'{x:.3f}' for x in (v, omega, omega_R, omega_L)] == ['0.500', '2.356', '20.864', '9.440']
-    through_body = dd.unicycle_jacobian(state[2]) @ [v, omega]
-    close(through_body, [0.5, 0.0, 0.75 * np.pi])
-    close(dd.wheel_to_world_jacobian(state[2], R, L) @ [omega_R, omega_L], through_body)
-
-
-def test_the_check_of_document_e():
-    # Left wheel 1, right wheel -1, r = L = 1: a turn to the right.
-    assert dd.wheel_to_body(-1.0, 1.0, 1.0, 1.0) == (0.0, -2.0)
-    # A slip: the document prints [left, right] = [1, -1] here, its own inverse gives [-1, 1].
-    omega_R, omega_L = dd.body_to_wheel(0.0, 2.0, 1.0, 1.0)
-    assert [omega_L, omega_R] == [-1.0, 1.0]
-    # Its matrices, with the columns of the forward one and the rows of the inverse in our order.
-    assert np.array_equal(dd.wheel_to_body_jacobian(1.0, 1.0)[:, ::-1], [[0.5, 0.5], [-1.0, 1.0]])
-    assert np.array_equal(dd.body_to_wheel_jacobian(1.0, 1.0)[::-1], [[1.0, -0.5], [1.0, 0.5]])
-
-
-# --- Shapes and bad input
-
-
-def test_every_function_broadcasts_over_leading_axes():
-    rng = np.random.default_rng(3)
-    theta, first, second = rng.normal(size=(4, 1)), rng.normal(size=(4, 1)), rng.normal(size=5)
-    r, L = rng.uniform(0.01, 0.1, 5), rng.uniform(0.1, 1.0, (4, 1))
-    for function, arguments in [
-        (dd.unicycle_jacobian, (theta,)),
-        (dd.no_lateral_slip_constraint, (theta,)),
-        (dd.wheel_to_body_jacobian, (r, L)),
-        (dd.body_to_wheel_jacobian, (r, L)),
-        (dd.wheel_to_world_jacobian, (theta, r, L)),
-        (lambda *args: dd.wheel_centres(np.stack(np.broadcast_arrays(*args), -1), 0.16), (theta, r, L)),
-        (lambda theta, L: dd.wheel_centre_velocities(theta, [1.0, 2.0, 3.0], L), (theta, L)),
-        (lambda *args: dd.rolling_constraints(*args)[0], (theta, r, L)),
-        (lambda *args: dd.rolling_constraints(*args)[1], (theta, r, L)),
-        (lambda *args: np.stack(dd.body_to_wheel(*args), -1), (first, second, r, L)),
-        (lambda *args: np.stack(dd.wheel_to_body(*args), -1), (first, second, r, L)),
-    ]:
-        at_once = function(*arguments)
-        grid = np.broadcast_arrays(*arguments)
-        looped = np.array(
-            [function(*entry) for entry in zip(*(axis.flat for axis in grid), strict=True)]
-        )
-        assert at_once.shape == grid[0].shape + looped.shape[1:]
-        np.testing.assert_allclose(at_once.reshape(looped.shape), looped, rtol=1e-14, atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    'bad', [0.0, -0.033, np.nan, np.inf, -np.inf, 0, [0.1, 0.0], np.array([np.nan, 1.0])]
-)
-@pytest.mark.parametrize('name', ['r', 'L'])
-def test_a_length_that_is_not_positive_and_finite_is_named(name, bad):
-    lengths = {'r': R, 'L': L, name: bad}
-    for call in [
-        dd.wheel_to_body_jacobian,
-        dd.body_to_wheel_jacobian,
-        lambda **lengths: dd.wheel_to_world_jacobian(0.0, **lengths),
-        lambda **lengths: dd.rolling_constraints(0.0, **lengths),
-        lambda **lengths: dd.body_to_wheel(1.0, 1.0, **lengths),
-        lambda **lengths: dd.wheel_to_body(1.0, 1.0, **lengths),
-    ]:
-        with pytest.raises(ValueError, match=rf'^{name} must be positive and finite'):
-            call(**lengths)
+# --- Shapes
 
 
 def test_both_results_have_the_shape_of_all_arguments():
@@ -235,7 +140,3 @@ def test_both_results_have_the_shape_of_all_arguments():
     ):
         first, second = result
         assert first.shape == second.shape == np.broadcast_shapes(first.shape, (2, 1))
-    v, omega = dd.wheel_to_body([1.0, 2.0], [3.0, 4.0], 0.033, separations)
-    for i, j in np.ndindex(2, 2):
-        one = dd.wheel_to_body(1.0 + j, 3.0 + j, 0.033, float(separations[i, 0]))
-        assert (v[i, j], omega[i, j]) == one

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,7 +18,6 @@ from ik_tasks import (
     Task,
     anywhere,
     assert_same,
-    at,
     configurations,
     unreachable,
 )
@@ -29,11 +29,9 @@ from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 
 @pytest.mark.parametrize('method', METHODS)
-@pytest.mark.parametrize(
-    ('arm', 'heading'), [(TWO, False), (THREE, False), (THREE, True), (FIVE, False), (FIVE, True)]
-)
+@pytest.mark.parametrize(('arm', 'heading'), [(TWO, False), (THREE, True), (FIVE, False)])
 def test_near_starts_converge_by_every_method(arm, heading, method):
-    task, q = Task(arm, heading), configurations(arm, 100)
+    task, q = Task(arm, heading), configurations(arm, 40)
     q0 = q + np.random.default_rng(2).uniform(-0.2, 0.2, q.shape)
     target = task.forward(q)
     result = task.solve(target, q0, method=method, max_iterations=5000)
@@ -46,11 +44,10 @@ def test_near_starts_converge_by_every_method(arm, heading, method):
 
 
 @pytest.mark.parametrize('damping', [1e-300, 0.1, 1e6])
-@pytest.mark.parametrize('heading', [False, True])
-@pytest.mark.parametrize('arm', [THREE, FIVE], ids=['three', 'five'])
+@pytest.mark.parametrize(('arm', 'heading'), [(THREE, True), (FIVE, False)])
 def test_levenberg_marquardt_converges_from_anywhere(arm, heading, damping):
     task = Task(arm, heading)
-    result = task.solve(task.forward(anywhere(arm, 200, 4)), anywhere(arm, 200, 5), damping=damping)
+    result = task.solve(task.forward(anywhere(arm, 100, 4)), anywhere(arm, 100, 5), damping=damping)
     assert result.converged.all()
     assert np.median(result.iterations) < 30
     assert result.iterations.max() < 100
@@ -96,14 +93,7 @@ def test_newton_is_document_c_with_its_lost_minus():
     assert np.linalg.norm(goal - task.forward(printed[None])[0]) > np.linalg.norm(goal - r) > one.error
 
 
-def test_newton_takes_the_least_step_of_a_redundant_arm():
-    q, goal = np.array([0.3, 0.8, -0.5]), np.array([1.5, 0.9])
-    step = np.linalg.pinv(THREE.jacobian(q)) @ (goal - THREE.forward_kinematics(q)[:2])
-    result = Task(THREE).solve(goal, q, method='newton', max_iterations=1)
-    np.testing.assert_allclose(result.q, q + step, rtol=1e-12)
-
-
-@pytest.mark.parametrize('damping', [1e-3, 0.1, 7.0])
+@pytest.mark.parametrize('damping', [1e-3, 7.0])
 def test_levenberg_marquardt_is_document_d_with_its_lambda_not_squared(damping):
     q, goal, m = np.array([0.3, 0.8, -0.5]), np.array([1.3, 1.0, 1.0]), np.array([1.0, 4.0, 0.25])
     J, M = THREE.jacobian(q, heading=True), np.diag(m)
@@ -140,16 +130,8 @@ def test_the_error_falls_with_every_step_that_is_taken(method):
     assert taken_back > 5
 
 
-def test_newton_takes_steps_that_make_it_worse():
-    task = Task(TWO)
-    task.solve([2.0, 2.0], [0.3, 0.4], method='newton', max_iterations=30)
-    assert len(task.derived) >= 30
-    errors = [np.linalg.norm(np.array([2.0, 2.0]) - task.forward(q)) for q in task.derived]
-    assert np.any(np.diff(errors) > 0.1)
-
-
 def test_newton_may_get_worse_and_gives_the_best_it_saw():
-    task, target, q0 = Task(TWO), np.full((100, 2), 2.0), anywhere(TWO, 100)
+    task, target, q0 = Task(TWO), np.full((20, 2), 2.0), anywhere(TWO, 20)
     errors = [
         task.solve(target, q0, method='newton', max_iterations=steps).error for steps in range(1, 12)
     ]
@@ -173,9 +155,6 @@ def test_pose_difference_wraps_the_heading_only():
     ]
     np.testing.assert_allclose(pose_difference(target, pose), expected, atol=1e-15)
     np.testing.assert_allclose(pose_difference(target[0], pose[0]), expected[0], atol=1e-15)
-    for bad, named in (([0.0, 0.0], 'shape'), ([0.0, 0.0, np.nan], 'finite'), (np.eye(3)[:2], 'axes')):
-        with pytest.raises(ValueError, match=f'pose must .*{named}'):
-            pose_difference(target, bad)
 
 
 @pytest.mark.parametrize('method', METHODS)
@@ -195,12 +174,13 @@ def test_a_heading_takes_the_short_way_across_half_a_turn(method):
 @pytest.mark.parametrize('method', METHODS)
 def test_a_masked_entry_is_as_if_it_were_not_there(method):
     pose, position = Task(THREE, heading=True), Task(THREE)
-    target, q0 = pose.forward(configurations(THREE, 40)), configurations(THREE, 40, 7)
+    target, q0 = pose.forward(configurations(THREE, 20)), configurations(THREE, 20, 7)
     target[:, 2] = 3.0
     masked = pose.solve(target, q0, method=method, mask=[1, 1, 0], max_iterations=50)
     assert_same(masked, position.solve(target[:, :2], q0, method=method, max_iterations=50))
 
 
+@pytest.mark.slow
 def test_weights_say_what_matters_where_not_all_can_be_had():
     # Two joints for three entries.
     task, q0, target = Task(TWO, heading=True), np.array([0.5, 0.5]), np.array([0.9, 0.9, 2.5])
@@ -221,9 +201,9 @@ def test_weights_say_what_matters_where_not_all_can_be_had():
 
 
 @pytest.mark.parametrize('method', METHODS)
-@pytest.mark.parametrize('unit', [1e-9, 1e-3, 1e3, 1e9])
+@pytest.mark.parametrize('unit', [1e-9, 1e3])
 def test_the_unit_of_length_does_not_matter(unit, method):
-    q, q0 = configurations(THREE, 30), configurations(THREE, 30, 8)
+    q, q0 = configurations(THREE, 15), configurations(THREE, 15, 8)
     target = Task(THREE).forward(q)
     metres = Task(THREE).solve(target, q0, method=method, max_iterations=100)
     other = Task(PlanarArm(unit * THREE.lengths)).solve(
@@ -256,11 +236,10 @@ def test_joints_may_have_other_units(method, damping):
 
 
 @pytest.mark.parametrize('method', DOWNHILL)
-@pytest.mark.parametrize('where', ['too far', 'in the hole'])
-@pytest.mark.parametrize('arm', LONG_FIRST, ids=['two', 'three'])
+@pytest.mark.parametrize(('where', 'arm'), [('too far', LONG_FIRST[0]), ('in the hole', LONG_FIRST[1])])
 def test_the_nearest_reachable_point_is_found(arm, where, method):
     task = Task(arm)
-    target, nearest, distance = unreachable(arm, where)
+    target, nearest, distance = unreachable(arm, where, 20)
     result = task.solve(target, anywhere(arm, len(target)), method=method, max_iterations=2000)
     assert not result.converged.any()
     np.testing.assert_allclose(result.error, distance, atol=1e-9)
@@ -281,33 +260,13 @@ def test_newton_ends_on_what_it_cannot_reach(where):
     assert np.all(result.error <= ROUNDING * np.linalg.norm(target - task.forward(q0), axis=1))
 
 
-@pytest.mark.parametrize('method', METHODS)
-@pytest.mark.parametrize('angle', [0.0, 0.3, 2.5])
-@pytest.mark.parametrize('distance', [0.5, 1.2, 2.5])
-def test_a_stretched_arm_sees_no_way_along_its_own_line(distance, angle, method):
-    # No joint moves the tip that way: a singular start, of which the caller is told.
-    q0 = np.array([angle, 0.0])
-    result = Task(TWO).solve(at(distance, angle), q0, method=method, restarts=0)
-    assert not result.converged
-    assert result.iterations == result.restarts == result.start == 0
-    assert np.array_equal(result.q, q0)
-    assert result.error == pytest.approx(abs(1.7 - distance))
-
-
-def test_steps_run_out():
-    result = Task(THREE).solve([1.0, 0.5], [0.1, 0.2, 0.3], method='transpose', max_iterations=3)
-    assert not result.converged
-    assert result.iterations == 3
-    assert result.error > TOLERANCE
-
-
 # --- Batches
 
 
 @pytest.mark.parametrize('method', METHODS)
 def test_a_batch_is_one_after_the_other(method):
-    task, target = Task(THREE), np.random.default_rng(9).uniform(-2.0, 2.0, (40, 2))
-    q0 = configurations(THREE, 40)
+    task, target = Task(THREE), np.random.default_rng(9).uniform(-2.0, 2.0, (20, 2))
+    q0 = configurations(THREE, 20)
     # Rounding, which differs, grows on the ways of newton and of transpose.
     steps = {'newton': 5, 'transpose': 15, 'levenberg_marquardt': 100}
     options = {'method': method, 'max_iterations': steps[method]}
@@ -371,7 +330,7 @@ def test_what_is_done_costs_nothing(method):
 
 
 @pytest.mark.parametrize('method', METHODS)
-@pytest.mark.parametrize('bad', [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize('bad', [np.nan, -np.inf])
 @pytest.mark.parametrize('which', ['forward', 'jacobian', 'difference'])
 def test_what_is_not_finite_ends_its_own_target_only(which, bad, method):
     task = Task(TWO)
@@ -414,31 +373,16 @@ def test_what_is_not_finite_ends_its_own_target_only(which, bad, method):
         assert np.array_equal(field[result.converged], other[result.converged])
 
 
-def test_of_nothing_no_difference_is_asked():
-    def nothing(q):
-        return np.full_like(q, np.nan)
-
-    result = solve(nothing, TWO.jacobian, [1.0, 1.0], [0.0, 1.0], difference=pytest.fail)
-    assert not result.converged
-    assert np.isnan(result.error)
-    assert result.q.tolist() == [0.0, 1.0]
-
-
 @pytest.mark.parametrize('method', METHODS)
-@pytest.mark.parametrize('scale', [1e-320, 1e-200, 1e-100, 1e100, 1e150, 1e200, 1e307])
+@pytest.mark.parametrize('scale', [1e-320, 1e-200, 1e150, 1e307])
 def test_numbers_without_measure_neither_raise_nor_warn(scale, method):
-    arm = Task(TWO)
+    arm, q0 = Task(TWO), configurations(TWO, 3)
+    target = np.array([[0.4, 0.6], [-0.9, 0.3], [1.9, 0.3]])
     for lift, steep in ((scale, 1.0), (1.0, scale), (scale, scale)):
-        result = solve(
-            lambda q, lift=lift: lift * arm.forward(q),
-            lambda q, steep=steep: steep * arm.jacobian(q),
-            lift * np.array([[0.4, 0.6], [-0.9, 0.3], [1.9, 0.3]]),
-            configurations(TWO, 3),
-            method=method,
-            max_iterations=40,
-            tolerance=min(1e-6, 1e-6 * lift) or 5e-324,
-        )
-        assert np.isfinite(result.q).all()
+        forward = partial(lambda lift, q: lift * arm.forward(q), lift)
+        jacobian = partial(lambda steep, q: steep * arm.jacobian(q), steep)
+        options = {'max_iterations': 40, 'tolerance': min(1e-6, 1e-6 * lift) or 5e-324}
+        assert np.isfinite(solve(forward, jacobian, lift * target, q0, method=method, **options).q).all()
 
 
 def test_functions_may_warn_write_and_use_their_memory_again():
@@ -480,97 +424,68 @@ def test_what_a_function_raises_comes_through():
 
 # --- Bad input
 
+ARGUMENTS = {
+    'forward': lambda q: TWO.forward_kinematics(q)[..., :2],
+    'jacobian': TWO.jacobian,
+    'target': [0.5, 0.5],
+    'q0': [0.1, 0.2],
+}
+NAN, INF = np.nan, np.inf
+
+
+@pytest.mark.parametrize(
+    ('name', 'values', 'allowed'),
+    [
+        ('target', [1.0, np.zeros((3, 0))], r'have shape \(\.\.\., m\)'),
+        ('target', [[NAN, 0.0]], 'be finite'),
+        ('target', ['home'], 'be an array of real numbers'),
+        ('q0', [1.0], r'have shape \(\.\.\., n\)'),
+        ('q0', [[0.0, -INF]], 'be finite'),
+        ('q0', [[[0.0, 1.0], [0.0]]], 'be an array of real numbers'),
+        ('method', ['gauss', None], 'be one of newton, transpose, levenberg_marquardt'),
+        ('mask', [[1.0], 1.0, np.ones((1, 2))], r'have shape \(2,\)'),
+        ('mask', [[0, 0]], 'have an entry that is not zero'),
+        ('mask', [[1.0, -1.0], [1.0, NAN], [1.0, INF]], 'be zero or positive and finite'),
+        ('tolerance', [0.0, -1e-6, NAN], 'be positive and finite'),
+        ('tolerance', [[1e-6, 1e-6]], 'be a single number'),
+        ('damping', [0.0, INF], 'be positive and finite'),
+        ('damping', ['much'], 'be a number'),
+        ('max_iterations', [0, -3, 10.0, True, None], 'be an integer of at least 1'),
+        ('restarts', [-1, 2.0], 'be an integer of at least 0'),
+        ('seed', [-1, 'today'], 'be an integer of at least 0'),
+        ('step_tolerance', [-1e-9], 'be zero or positive and finite'),
+        ('limits', [1.0, (1.0, 2.0, 3.0), ('low', 2.0)], r'be a pair \(lower, upper\)'),
+        ('limits', [([0.0] * 3, 2.0)], r'have shape \(\) or \(2,\)'),
+        ('limits', [(1.0, [2.0, 0.0]), (NAN, 1.0), (INF, INF)], 'be numbers with lower <= upper'),
+        ('forward', [TWO.forward_kinematics, lambda q: q[0]], r'return shape \(1, 2\)'),
+        (
+            'jacobian',
+            [partial(TWO.jacobian, heading=True), lambda q: np.eye(2)],
+            r'return shape \(1, 2, 2',
+        ),
+        ('difference', [lambda target, pose: target[0] - pose[0]], r'return shape \(1, 2\)'),
+    ],
+)
+def test_bad_arguments_are_named_with_what_is_allowed(name, values, allowed):
+    for value in values:
+        with pytest.raises(ValueError, match=rf'^{name} must {allowed}'):
+            solve(**ARGUMENTS | {name: value})
+
 
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
-        ({'target': 1.0}, r'^target must have shape \(\.\.\., m\), got \(\)'),
-        ({'target': np.zeros((3, 0))}, r'^target must have shape \(\.\.\., m\), got \(3, 0\)'),
-        ({'target': [np.nan, 0.0]}, '^target must be finite, got nan at index 0'),
-        ({'target': 'home'}, '^target must be an array of real numbers, got home'),
-        ({'q0': 1.0}, r'^q0 must have shape \(\.\.\., n\), got \(\)'),
-        ({'q0': [0.0, -np.inf]}, '^q0 must be finite, got -inf at index 1'),
-        ({'q0': [[0.0, 1.0], [0.0]]}, '^q0 must be an array of real numbers'),
-        (
-            {'target': np.zeros((4, 2)), 'q0': np.zeros((3, 2))},
-            r'^target and q0 must have leading axes that broadcast, got target \(4,\), q0 \(3,\)',
-        ),
-        (
-            {'method': 'gauss'},
-            "^method must be one of newton, transpose, levenberg_marquardt, got 'gauss'",
-        ),
-        ({'method': None}, '^method must be one of newton, transpose, levenberg_marquardt, got None'),
-        ({'mask': [1.0]}, r'^mask must have shape \(2,\), as target has m = 2, got \(1,\)'),
-        ({'mask': 1.0}, r'^mask must have shape \(2,\)'),
-        ({'mask': np.ones((1, 2))}, r'^mask must have shape \(2,\)'),
-        ({'mask': [0, 0]}, r'^mask must have an entry that is not zero, got \[0.0, 0.0\]'),
-        ({'mask': [1.0, -1.0]}, r'^mask must be zero or positive and finite, got -1.0 at index 1'),
-        ({'mask': [1.0, np.nan]}, '^mask must be zero or positive and finite, got nan at index 1'),
-        ({'mask': [1.0, np.inf]}, '^mask must be zero or positive and finite, got inf at index 1'),
-        ({'tolerance': 0.0}, '^tolerance must be positive and finite, got 0.0'),
-        ({'tolerance': -1e-6}, '^tolerance must be positive and finite, got -1e-06'),
-        ({'tolerance': np.nan}, '^tolerance must be positive and finite, got nan'),
-        ({'tolerance': [1e-6, 1e-6]}, r'^tolerance must be a single number, got shape \(2,\)'),
-        ({'damping': 0.0}, '^damping must be positive and finite, got 0.0'),
-        ({'damping': np.inf}, '^damping must be positive and finite, got inf'),
-        ({'damping': 'much'}, "^damping must be a number, got 'much'"),
-        ({'max_iterations': 0}, '^max_iterations must be an integer of at least 1, got 0'),
-        ({'max_iterations': -3}, '^max_iterations must be an integer of at least 1, got -3'),
-        ({'max_iterations': 10.0}, '^max_iterations must be an integer of at least 1, got 10.0'),
-        ({'max_iterations': True}, '^max_iterations must be an integer of at least 1, got True'),
-        ({'max_iterations': None}, '^max_iterations must be an integer of at least 1, got None'),
-        ({'restarts': -1}, '^restarts must be an integer of at least 0, got -1'),
-        ({'restarts': 2.0}, '^restarts must be an integer of at least 0, got 2.0'),
-        ({'seed': -1}, '^seed must be an integer of at least 0, got -1'),
-        ({'seed': 'today'}, "^seed must be an integer of at least 0, got 'today'"),
-        ({'step_tolerance': -1e-9}, '^step_tolerance must be zero or positive and finite, got -1e-09'),
-        ({'alpha': 0.1}, "^alpha is for the method transpose alone, got method 'levenberg_marquardt'"),
-        ({'alpha': 0.0, 'method': 'transpose'}, '^alpha must be positive and finite, got 0.0'),
-        ({'limits': 1.0}, r'^limits must be a pair \(lower, upper\)'),
-        ({'limits': (1.0, 2.0, 3.0)}, r'^limits must be a pair \(lower, upper\)'),
-        ({'limits': ('low', 2.0)}, r'^limits must be a pair .*lower must be an array of real numbers'),
-        ({'limits': ([0.0] * 3, 2.0)}, r'^limits must have shape \(\) or \(2,\), .* got \(3,\)'),
-        (
-            {'limits': (1.0, [2.0, 0.0])},
-            r'^limits must be numbers with lower <= upper, got \[1.0, 1.0\]',
-        ),
-        ({'limits': (np.nan, 1.0)}, '^limits must be numbers with lower <= upper'),
-        ({'limits': (np.inf, np.inf)}, '^limits must be numbers with lower <= upper'),
+        ({'target': np.zeros((4, 2)), 'q0': np.zeros((3, 2))}, 'target and q0 must have leading axes'),
+        ({'alpha': 0.1}, "alpha is for the method transpose alone, got method 'levenberg_marquardt'"),
+        ({'alpha': 0.0, 'method': 'transpose'}, 'alpha must be positive and finite, got 0.0'),
         (
             {'forward': lambda q: TWO.forward_kinematics(q[:1])[:, :2], 'jacobian': None},
-            r'^forward must return shape \(4, 2\) for q of shape \(4, 2\), got \(1, 2\)',
+            'forward must ret',
         ),
-        (
-            {'forward': TWO.forward_kinematics},
-            r'^forward must return shape \(1, 2\) for q of shape \(1, 2\), got \(1, 3\)',
-        ),
-        ({'forward': lambda q: q[0]}, r'^forward must return shape \(1, 2\) .* got \(2,\)'),
-        (
-            {'forward': lambda q: None},
-            r'^what forward returns must be an array of real numbers, got None',
-        ),
-        ({'forward': lambda q: q * 1j}, '^what forward returns must be an array of real numbers'),
-        (
-            {'jacobian': THREE.jacobian, 'q0': [0.1, 0.2]},
-            '^q must have shape',
-        ),
-        (
-            {'jacobian': lambda q: TWO.jacobian(q, heading=True)},
-            r'^jacobian must return shape \(1, 2, 2\) for q of shape \(1, 2\), got \(1, 3, 2\)',
-        ),
-        ({'jacobian': lambda q: np.eye(2)}, r'^jacobian must return shape \(1, 2, 2\) .* got \(2, 2\)'),
-        (
-            {'difference': lambda target, pose: target[0] - pose[0]},
-            r'^difference must return shape \(1, 2\) for q of shape \(1, 2\), got \(2,\)',
-        ),
+        ({'forward': lambda q: None}, 'what forward returns must be an array of real numbers, got None'),
+        ({'forward': lambda q: q * 1j}, 'what forward returns must be an array of real numbers'),
     ],
 )
-def test_bad_input_is_named(changes, message):
-    arguments = {
-        'forward': lambda q: TWO.forward_kinematics(q)[..., :2],
-        'jacobian': TWO.jacobian,
-        'target': [0.5, 0.5],
-        'q0': [0.1, 0.2],
-    }
-    with pytest.raises(ValueError, match=message):
-        solve(**{**arguments, **changes})
+def test_bad_combinations_and_results_are_reported(changes, message):
+    with pytest.raises(ValueError, match=f'^{message}'):
+        solve(**ARGUMENTS | changes)

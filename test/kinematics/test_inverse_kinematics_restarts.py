@@ -27,7 +27,7 @@ from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 # --- Nearly singular and singular
 
 
-def rim(short, count=20_000):
+def rim(short, count=5_000):
     """Return targets from random joints that need both long links aligned, and random starts."""
     arm = PlanarArm([1.0, short, 1.0])
     target, q0 = Task(arm).forward(anywhere(arm, count, 13)), anywhere(arm, count, 14)
@@ -35,12 +35,12 @@ def rim(short, count=20_000):
     return Task(arm), target[near], q0[near]
 
 
-@pytest.mark.parametrize('short', [1e-2, 1e-3, 1e-4])
+@pytest.mark.parametrize('short', [1e-2, 1e-4])
 @pytest.mark.parametrize('numeric', [False, True], ids=['jacobian', 'no jacobian'])
 def test_a_short_link_does_not_slow_levenberg_marquardt_down(short, numeric):
     # The long links have to stay aligned while the short one turns: J is nearly singular all the way.
     task, target, q0 = rim(short)
-    assert len(target) > 300
+    assert len(target) > 50
     jacobian = None if numeric else task.jacobian
     result = solve(task.forward, jacobian, target, q0, restarts=0)
     assert result.converged.all()
@@ -49,7 +49,7 @@ def test_a_short_link_does_not_slow_levenberg_marquardt_down(short, numeric):
 
 def test_the_nearest_point_of_a_long_chain_is_found_in_few_steps():
     arm = PlanarArm([0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2])
-    target, _, distance = unreachable(arm, 'too far')
+    target, _, distance = unreachable(arm, 'too far', 30)
     result = Task(arm).solve(target, anywhere(arm, len(target)), restarts=0)
     np.testing.assert_allclose(result.error, distance, atol=1e-9)
     assert result.iterations.max() < 50
@@ -69,11 +69,16 @@ def test_the_natural_first_try_is_reached(method):
 
 
 @pytest.mark.parametrize('method', METHODS)
-@pytest.mark.parametrize('angle', [0.0, 0.3, 2.5])
-@pytest.mark.parametrize('distance', [0.5, 1.2, 2.5])
-def test_a_stretched_arm_is_restarted(distance, angle, method):
+@pytest.mark.parametrize(('distance', 'angle'), [(0.5, 0.0), (1.2, 2.5), (2.5, 0.3)])
+def test_a_stretched_arm_is_restarted_as_no_joint_moves_it_along_its_own_line(distance, angle, method):
+    target, q0 = at(distance, angle), np.array([angle, 0.0])
+    alone = Task(TWO).solve(target, q0, method=method, restarts=0)
+    assert not alone.converged
+    assert alone.iterations == alone.restarts == alone.start == 0
+    assert np.array_equal(alone.q, q0)
+    assert alone.error == pytest.approx(abs(1.7 - distance))
     steps = 5000 if method == 'transpose' else 500
-    result = Task(TWO).solve(at(distance, angle), [angle, 0.0], method=method, max_iterations=steps)
+    result = Task(TWO).solve(target, q0, method=method, max_iterations=steps)
     assert result.converged == (distance < 1.7)
     assert result.restarts > 0
     assert result.error == pytest.approx(max(0.0, distance - 1.7), abs=TOLERANCE)
@@ -95,9 +100,6 @@ class Walled(Task):
         self.seen.append(q.copy())
         return super().forward(q)
 
-    def jacobian(self, q):
-        return super().jacobian(q)
-
     def inside(self, count, seed):
         lower, upper = (np.clip(side, -np.pi, np.pi) for side in self.limits)
         return np.random.default_rng(seed).uniform(lower, upper, (count, self.arm.joints))
@@ -108,10 +110,10 @@ class Walled(Task):
 
 def test_restarts_find_what_one_search_does_not():
     task = Walled(THREE, -2.0, 2.0, heading=True)
-    target, q0 = task.forward(task.inside(300, 0)), task.inside(300, 1)
+    target, q0 = task.forward(task.inside(100, 0)), task.inside(100, 1)
     alone, several = task.solve(target, q0, restarts=0), task.solve(target, q0, restarts=100)
-    assert np.count_nonzero(alone.converged) < 250
-    assert np.count_nonzero(several.converged) >= 299
+    assert np.count_nonzero(alone.converged) < 85
+    assert np.count_nonzero(several.converged) >= 99
     assert not alone.restarts.any()
     # The first search is the same but for rounding, and what it finds stays.
     by_first = several.start == 0
@@ -135,7 +137,7 @@ def test_restarts_are_the_same_for_the_same_seed():
     assert_same(one, drawn)
 
 
-@pytest.mark.parametrize('restarts', [0, 1, 2, 5])
+@pytest.mark.parametrize('restarts', [0, 1, 5])
 def test_restarts_end(restarts):
     task, (target, _, distance) = Task(LONG_FIRST[1]), unreachable(LONG_FIRST[1], 'too far')
     q0 = anywhere(LONG_FIRST[1], len(target))
@@ -149,10 +151,10 @@ def test_restarts_end(restarts):
 
 def test_a_search_that_runs_in_circles_is_restarted():
     task = Task(TWO)
-    target, q0 = task.forward(anywhere(TWO, 300, 15)), anywhere(TWO, 300, 16)
+    target, q0 = task.forward(anywhere(TWO, 100, 15)), anywhere(TWO, 100, 16)
     alone = task.solve(target, q0, method='newton', restarts=0)
     several = task.solve(target, q0, method='newton', max_iterations=2000)
-    assert np.count_nonzero(alone.converged) < 290
+    assert np.count_nonzero(alone.converged) < 97
     assert several.converged.all()
 
 
@@ -163,26 +165,26 @@ def test_a_search_that_runs_in_circles_is_restarted():
 @pytest.mark.parametrize('numeric', [False, True], ids=['jacobian', 'no jacobian'])
 def test_solutions_are_within_the_limits(method, numeric):
     task = Walled(THREE, [-3.0, -0.2, -np.inf], [1.0, 2.4, 1.5])
-    target, q0 = task.forward(task.inside(200, 0)), task.inside(200, 1)
+    target, q0 = task.forward(task.inside(60, 0)), task.inside(60, 1)
     jacobian = None if numeric else task.jacobian
     result = solve(task.forward, jacobian, target, q0, method=method, limits=task.limits)
     # `forward` checks that nothing beyond them was asked.
     task.forward(result.q)
-    assert np.count_nonzero(result.converged) >= (190 if method == 'transpose' else 200)
+    assert np.count_nonzero(result.converged) >= (55 if method == 'transpose' else 60)
 
 
 @pytest.mark.parametrize('method', DOWNHILL)
 def test_the_nearest_point_within_the_limits_is_found(method):
     task = Walled(TWO, [-1.0, 0.3], [0.5, 1.5])
-    target = np.random.default_rng(17).uniform(-2.0, 2.0, (40, 2))
-    result = task.solve(target, task.inside(40, 1), method=method, max_iterations=5000)
+    target = np.random.default_rng(17).uniform(-2.0, 2.0, (20, 2))
+    result = task.solve(target, task.inside(20, 1), method=method, max_iterations=2000)
     grid = np.stack(np.meshgrid(np.linspace(-1.0, 0.5, 301), np.linspace(0.3, 1.5, 301)), axis=-1)
     points = TWO.forward_kinematics(grid.reshape(-1, 2))[:, :2] @ [1.0, 1j]
     least = np.array([np.abs(one - points).min() for one in target @ [1.0, 1j]])
-    assert np.count_nonzero(~result.converged) > 20
+    assert np.count_nonzero(~result.converged) > 10
     assert np.all(result.error >= least - 0.01)
     # Limits leave local minima, and several searches may end in the same one.
-    assert np.count_nonzero(result.error <= least + TOLERANCE) >= 38
+    assert np.count_nonzero(result.error <= least + TOLERANCE) >= 18
     around = np.clip(
         result.q[:, np.newaxis] + [[0.01, 0], [-0.01, 0], [0, 0.01], [0, -0.01]], *task.limits
     )
@@ -285,7 +287,7 @@ def test_transpose_is_sensitive_to_alpha():
 @pytest.mark.parametrize('method', METHODS)
 @pytest.mark.parametrize('heading', [False, True])
 def test_without_a_jacobian_it_goes_the_same_way(heading, method):
-    task, q = Task(FIVE, heading), configurations(FIVE, 40)
+    task, q = Task(FIVE, heading), configurations(FIVE, 15)
     target, q0 = task.forward(q), q + np.random.default_rng(2).uniform(-0.2, 0.2, q.shape)
     given = task.solve(target, q0, method=method, max_iterations=15)
     task.derived.clear()

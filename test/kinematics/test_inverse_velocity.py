@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from public_calls import BROADCASTING, WIDE, X_DOT
 
-from diffdrive_jacobian.kinematics import diff_drive, joint_limits, manipulability, task_priority
+from diffdrive_jacobian.kinematics import diff_drive
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
@@ -19,9 +19,9 @@ EPS = np.finfo(float).eps
 SVD = 300.0 * EPS  # LAPACK stops when what is left beside the singular values is below some 90 eps.
 deterministic = settings(deadline=None, derandomize=True)
 shapes = pytest.mark.parametrize(
-    ('m', 'n'),
-    [*((1, n) for n in (1, 2, 5)), *((m, n) for m in (2, 3, 4) for n in (1, 2, 3, 4, 7))],
+    ('m', 'n'), [(1, 1), (1, 5), (2, 1), (2, 2), (2, 7), (3, 2), (3, 3), (3, 4), (4, 7)]
 )
+TASK = WIDE, X_DOT
 
 
 def norm(vectors):
@@ -40,7 +40,7 @@ def times(matrices, vectors):
     return (matrices @ vectors[..., np.newaxis])[..., 0]
 
 
-def decomposed(m, n, count=2000, seed=1):
+def decomposed(m, n, count=500, seed=1):
     """Give J = U diag(s) V^T of all scales, s from 1 down to 1e-16 and exact zeros."""
     rng = np.random.default_rng(seed)
     U, _, V_T = np.linalg.svd(rng.normal(size=(count, m, n)), full_matrices=False)
@@ -72,15 +72,6 @@ def test_the_adjugate_inverts_what_is_not_singular_and_names_the_determinant_of_
             np.testing.assert_allclose(inverse, other, rtol=0.0, atol=tolerance * np.abs(other).max())
 
 
-def test_the_adjugate_inverts_what_is_nearly_singular():
-    least = 1e-14
-    J, _, s, _ = decomposed(2, 2)
-    J = J[s.min(axis=-1) > least * s.max(axis=-1)]
-    assert len(J) > 100
-    P = np.linalg.inv(J)
-    assert np.all(size(iv.adjugate_inverse(J) - P) <= SVD / least * size(P))
-
-
 def test_the_adjugate_never_gives_what_is_rounding_error_only():
     J, _, s, _ = decomposed(2, 2, count=1000)
     J[::5] = J[::5, :1] * J[::5, :, :1]  # rank 1
@@ -96,7 +87,7 @@ def test_the_adjugate_never_gives_what_is_rounding_error_only():
     assert np.all(size(inverses[which] - right) <= 0.01 * size(right))
 
 
-@pytest.mark.parametrize('scale', [1e-300, 1e-161, 1e-140, 1e-30, 1e150, 1e200, 1e307])
+@pytest.mark.parametrize('scale', [1e-310, 1e-161, 1e-140, 1e150, 1e200])
 def test_the_adjugate_inverts_whatever_the_units_or_raises_an_error(scale):
     J = np.array([[1.0, 1.0], [0.5, 2.0]])
     if scale < 1e-145:
@@ -110,16 +101,9 @@ def test_the_adjugate_inverts_whatever_the_units_or_raises_an_error(scale):
         np.testing.assert_allclose(inverse, np.linalg.inv(J), rtol=1e-12)
 
 
-def test_an_inverse_that_no_number_can_hold_is_refused():
-    tiny = np.eye(2) * 1e-310
-    with pytest.raises(np.linalg.LinAlgError, match='must not be singular'):
-        iv.adjugate_inverse(tiny)
-
-
-@pytest.mark.parametrize('other', [0.0, 1e-140, 1e150])
-def test_what_becomes_of_a_jacobian_does_not_depend_on_its_company(other):
+def test_what_becomes_of_a_jacobian_does_not_depend_on_its_company():
     J = np.array([[0.1, 0.2, 0.3], [0.2, 0.4, 0.6 * (1.0 + 1e-12)]])
-    company = np.stack([J, np.full((2, 3), other)])
+    company = np.stack([J, np.zeros((2, 3)), np.full((2, 3), 1e-140), np.full((2, 3), 1e150)])
     alone = iv.damped_least_squares(J, [1.0, 0.0], [0.0, 0.1])
     together = iv.damped_least_squares(company[:, np.newaxis], [1.0, 0.0], [0.0, 0.1])
     assert np.array_equal(together[0], alone)
@@ -127,7 +111,7 @@ def test_what_becomes_of_a_jacobian_does_not_depend_on_its_company(other):
 
 
 def test_the_axle_centre_is_refused_and_so_is_one_of_a_batch_with_its_index():
-    theta, r, L = np.random.default_rng(3).uniform(0.01, 3.0, (3, 500))
+    theta, r, L = np.random.default_rng(3).uniform(0.01, 3.0, (3, 100))
     for J in [*diff_drive.wheel_to_position_jacobian(theta, r, L), np.zeros((2, 2))]:
         with pytest.raises(np.linalg.LinAlgError, match=r'a determinant of 0$'):
             iv.adjugate_inverse(J)
@@ -225,7 +209,7 @@ def test_with_damping_it_is_the_dense_solution_and_that_of_each_singular_value(m
 
 @shapes
 def test_no_joint_is_faster_than_the_damping_allows(m, n):
-    J, *_ = decomposed(m, n, count=1000)
+    J, *_ = decomposed(m, n)
     J[::10] = 0.0
     J[1::10] = J[1::10, :1]  # equal rows
     J[2::10] = J[2::10, :, :1]  # equal columns
@@ -320,131 +304,44 @@ def test_a_masked_task_minimises_the_weighted_error_and_omits_entries_of_weight_
         np.testing.assert_allclose(alone, expected, atol=1e-12)
 
 
-# --- Shapes and bad input
-
-J, X_DOT, Q, WEIGHTS = np.ones((2, 3)), np.ones(2), np.zeros(3), np.array([1.0, 2.0, 0.5])
-VALID = {
-    iv.adjugate_inverse: {'J': np.array([[1.0, 2.0], [0.5, 3.0]])},
-    iv.pseudoinverse: {'J': J, 'weights': WEIGHTS},
-    iv.manipulability: {'J': J},
-    iv.velocity_ellipsoid: {'J': J},
-    iv.force_ellipsoid: {'J': J},
-    iv.smallest_singular_value: {'J': J},
-    iv.condition_number: {'J': J},
-    iv.masked_task: {'J': J, 'x_dot': X_DOT, 'mask': np.array([1.0, 0.0])},
-    iv.damping: {'manipulability': 0.1, 'threshold': 0.2, 'maximum': 0.3},
-    iv.damped_least_squares: {'J': J, 'x_dot': X_DOT, 'damping': 0.1, 'weights': WEIGHTS},
-    iv.null_space_projector: {'J': J, 'damping': 0.1, 'weights': WEIGHTS},
-    iv.manipulability_gradient: {'jacobian': lambda q: np.cos(q)[..., np.newaxis, :], 'q': Q},
-    iv.joint_limit_cost: {'q': Q, 'lower': Q - 1.0, 'upper': Q + 1.0},
-    iv.joint_limit_gradient: {'q': Q, 'lower': Q - 1.0, 'upper': Q + 1.0},
-    iv.redundant: {'J': J, 'x_dot': X_DOT, 'q_dot_0': Q, 'damping': 0.1, 'weights': WEIGHTS},
-    iv.prioritized: {
-        **{'tasks': [(J, X_DOT), (np.array([[1.0, 0.0, 2.0]]), [0.5])], 'damping': 0.1},
-        **{'cutoff': 1e-9, 'weights': WEIGHTS, 'max_velocity': WEIGHTS},
-    },
-    iv.limit_velocity: {'q_dot': WEIGHTS, 'max_velocity': WEIGHTS},
-}
-RAGGED = [[1.0], [1.0, 2.0]]
-NO_ARRAYS = ('jacobian', 'tasks', 'cutoff')
-MAY_BE_NONE = ('weights', 'max_velocity')
-ARGUMENTS = [(function, name) for function, arguments in VALID.items() for name in arguments]
-
-
-def test_every_public_function_is_given_bad_input_here():
-    modules = (iv, joint_limits, manipulability, task_priority)
-    functions = {
-        function
-        for module in modules
-        for _, function in inspect.getmembers(module, inspect.isfunction)
-        if function.__module__ == module.__name__
-    }
-    assert all(hasattr(iv, function.__name__) for function in functions if function.__name__[0] != '_')
-    assert {f for f in functions if not f.__name__.startswith('_')} == set(VALID)
-
-
-@pytest.mark.parametrize(('function', 'name'), [of for of in ARGUMENTS if of[1] not in NO_ARRAYS[:2]])
-def test_what_is_no_finite_real_number_is_named(function, name):
-    shape = np.shape(VALID[function][name])
-    infinite = () if name == 'max_velocity' else (np.inf,)
-    for number in (np.nan, *infinite, -np.inf, 1j):
-        with pytest.raises(ValueError, match=rf'^{name} must .*got'):
-            function(**VALID[function] | {name: np.full(shape, number)[()]})
-    for bad in ('north', RAGGED, {}) + (() if name in MAY_BE_NONE else (None,)):
-        with pytest.raises(ValueError, match=rf'^{name} must .*got'):
-            function(**VALID[function] | {name: bad})
-
-
-def test_text_that_looks_like_numbers_is_no_number():
-    for text in ('1.0', ['1', '2'], b'1.0'):
-        with pytest.raises(ValueError, match=r'^manipulability must be'):
-            iv.damping(text, 1.0, 1.0)
-
-
-@pytest.mark.parametrize(('function', 'name'), [of for of in ARGUMENTS if of[1] not in NO_ARRAYS])
-def test_every_function_broadcasts_over_leading_axes_and_names_those_that_do_not(function, name):
-    fixed = {key: value for key, value in VALID[function].items() if key in NO_ARRAYS}
-    shapes = {key: np.shape(value) for key, value in VALID[function].items() if key not in NO_ARRAYS}
-    rng, alone = np.random.default_rng(13), len(shapes) == 1
-    lead = {key: (4, 5) if alone else (4, 1) if key == name else (5,) for key in shapes}
-    batch = {key: VALID[function][key] + 0.01 * rng.random(lead[key] + shapes[key]) for key in shapes}
-    at_once = function(**batch, **fixed)
-    whole = {key: np.broadcast_to(batch[key], (4, 5, *shapes[key])) for key in shapes}
-    for index in np.ndindex(4, 5):
-        one = function(**{key: value[index] for key, value in whole.items()}, **fixed)
-        batched = [part[index] for part in at_once] if isinstance(one, tuple) else [at_once[index]]
-        for got, expected in zip(batched, one if isinstance(one, tuple) else [one], strict=True):
-            np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-12)
-    wrong = {key: np.stack([VALID[function][key]] * (2 if key == name else 3)) for key in shapes}
-    if not alone:
-        with pytest.raises(ValueError, match=rf'\b{name}\b.* must .*got'):
-            function(**wrong, **fixed)
-
-
-TWO, THREE = (np.eye(2), np.ones(2)), (np.eye(3), np.ones(3))
-BAD = [
-    (iv.adjugate_inverse, {'J': np.ones((2, 3))}, r'^J must have shape .*2, 2.* got \(2, 3\)'),
-    (iv.adjugate_inverse, {'J': np.eye(3)}, r'^J must have shape .*2, 2.* got \(3, 3\)'),
-    (iv.pseudoinverse, {'J': np.ones(3)}, r'^J must have shape \(\.\.\., m, n\), got \(3,\)'),
-    (iv.pseudoinverse, {'J': np.ones((0, 3))}, r'^J must have shape .* got \(0, 3\)'),
-    (iv.redundant, {'x_dot': [1.0]}, r'^x_dot must have shape .*2.* got \(1,\)'),
-    (iv.redundant, {'q_dot_0': [1.0, 2.0]}, r'^q_dot_0 must have shape .*3.* got \(2,\)'),
-    (iv.damped_least_squares, {'x_dot': np.ones(3)}, r'^x_dot must have shape .*2.* got \(3,\)'),
-    (iv.damped_least_squares, {'damping': -0.1}, r'^damping must be zero or positive.* got -0\.1'),
-    (iv.damped_least_squares, {'weights': [1.0, 0.0, 1.0]}, r'^weights must be positive .* got 0\.0'),
-    (iv.pseudoinverse, {'weights': -WEIGHTS}, r'^weights must be positive .* got -1\.0'),
-    (iv.redundant, {'weights': [1.0, 2.0]}, r'^weights must have shape .*3.* got \(2,\)'),
-    (iv.null_space_projector, {'damping': -0.1}, r'^damping must be zero or positive.* got -0\.1'),
-    (iv.prioritized, {'damping': -0.1}, r'^damping must be zero or positive.* got -0\.1'),
-    (iv.prioritized, {'max_velocity': [1.0, 0.0, 1.0]}, r'^max_velocity must be positive, got'),
-    (iv.limit_velocity, {'max_velocity': [1.0, 2.0]}, r'^max_velocity must have shape .* got \(2,\)'),
-    (iv.damping, {'manipulability': -1e-9}, r'^manipulability must be zero or .* got -1e-09'),
-    (iv.masked_task, {'mask': [1.0, -1.0]}, r'^mask must be zero or positive .* got -1'),
-    (iv.masked_task, {'mask': [1.0]}, r'^mask must have shape .*2.* got \(1,\)'),
-    (iv.velocity_ellipsoid, {'J': np.ones(3)}, r'^J must have shape \(\.\.\., m, n\), got'),
-    (iv.damping, {'threshold': 0.0}, r'^threshold must be positive .* got 0'),
-    (iv.damping, {'maximum': -1.0}, r'^maximum must be zero or positive .* got -1'),
-    (iv.joint_limit_cost, {'upper': Q - 1.0}, r'^upper must be above lower'),
-    (iv.joint_limit_gradient, {'upper': Q - 2.0}, r'^upper must be above lower'),
-    (iv.joint_limit_cost, {'lower': Q + 2.0, 'upper': Q + 1.0}, r'^upper must be above lower'),
-    (iv.joint_limit_gradient, {'q': [0.0]}, r'^(q|lower|upper)\b.* must .*got'),
-    (iv.manipulability_gradient, {'jacobian': lambda q: np.eye(2)}, r'^jacobian must return'),
-    (iv.manipulability_gradient, {'q': 0.0}, r'^q must have shape'),
-    (iv.prioritized, {'tasks': []}, r'^tasks must contain at least one'),
-    (iv.prioritized, {'tasks': [TWO, THREE]}, r'^tasks must all be about the same joints.*2, 3'),
-    (iv.prioritized, {'tasks': [(J, [1.0, np.nan])]}, r'^x_dot of task 0 must be finite'),
-    (iv.prioritized, {'tasks': [TWO, (RAGGED, [1.0])]}, r'^J of task 1 must be an array'),
-    (iv.prioritized, {'tasks': [(J, [1.0])]}, r'^x_dot of task 0 must have shape'),
-    (iv.prioritized, {'tasks': [TWO[:1]]}, r'\btask'),
-    (iv.prioritized, {'tasks': [np.eye(3)]}, r'\btask'),
-    (iv.prioritized, {'tasks': 7}, r'\btask'),
-    (iv.prioritized, {'cutoff': 0.0}, r'^cutoff must be positive'),
-]
+# --- Bad input
 
 
 @pytest.mark.parametrize(
-    ('function', 'bad', 'message'), BAD, ids=[f'{f.__name__} {next(iter(bad))}' for f, bad, _ in BAD]
+    ('function', 'bad', 'message'),
+    [
+        (iv.adjugate_inverse, {'J': np.ones((2, 3))}, r'J must have shape .*2, 2.* got \(2, 3\)'),
+        (iv.pseudoinverse, {'J': np.ones(3)}, r'J must have shape \(\.\.\., m, n\), got \(3,\)'),
+        (iv.pseudoinverse, {'J': np.ones((0, 3))}, r'J must have shape .* got \(0, 3\)'),
+        (iv.redundant, {'q_dot_0': [1.0, 2.0]}, r'q_dot_0 must have shape .*3.* got \(2,\)'),
+        (iv.damped_least_squares, {'damping': -0.1}, r'damping must be zero or positive.* got -0\.1'),
+        (iv.null_space_projector, {'damping': -0.1}, r'damping must be zero or positive.* got -0\.1'),
+        (iv.damped_least_squares, {'weights': [1.0, 0.0, 1.0]}, r'weights must be positive .* got 0\.0'),
+        (iv.damping, {'manipulability': -1e-9}, r'manipulability must be zero or .* got -1e-09'),
+        (iv.damping, {'threshold': 0.0}, r'threshold must be positive .* got 0'),
+        (iv.damping, {'maximum': -1.0}, r'maximum must be zero or positive .* got -1'),
+        (iv.masked_task, {'mask': [1.0, -1.0]}, r'mask must be zero or positive .* got -1'),
+        (iv.joint_limit_cost, {'upper': [-3.0, 1.0]}, r'upper must be above lower'),
+        (iv.joint_limit_gradient, {'upper': [-4.0, 1.0]}, r'upper must be above lower'),
+        (iv.manipulability_gradient, {'jacobian': lambda q: np.eye(2)}, r'jacobian must return'),
+        (iv.limit_velocity, {'max_velocity': [1.0, 0.0, 1.0]}, r'max_velocity must be positive, got'),
+        (iv.prioritized, {'max_velocity': [1.0, 0.0, 1.0]}, r'max_velocity must be positive, got'),
+        (iv.prioritized, {'damping': -0.1}, r'damping must be zero or positive.* got -0\.1'),
+        (iv.prioritized, {'cutoff': 0.0}, r'cutoff must be positive'),
+        (iv.prioritized, {'cutoff': np.nan}, r'cutoff must be positive'),
+        (iv.prioritized, {'tasks': []}, r'tasks must contain at least one'),
+        (iv.prioritized, {'tasks': 7}, r'tasks must be pairs .* got 7'),
+        (iv.prioritized, {'tasks': [np.eye(3)]}, r'tasks must be pairs'),
+        (iv.prioritized, {'tasks': [TASK, (np.eye(2), [1.0, 1.0])]}, r'tasks must all .*joints.*3, 2'),
+        (iv.prioritized, {'tasks': [(TASK[0], [1.0, np.nan])]}, r'x_dot of task 0 must be finite'),
+        (
+            iv.prioritized,
+            {'tasks': [TASK, ([[1.0], [1.0, 2.0]], [1.0])]},
+            r'J of task 1 must be an array',
+        ),
+        (iv.prioritized, {'tasks': [(TASK[0], [1.0])]}, r'x_dot of task 0 must have shape'),
+    ],
 )
 def test_an_error_names_the_argument_what_was_got_and_what_is_allowed(function, bad, message):
-    with pytest.raises(ValueError, match=message):
-        function(**VALID[function] | bad)
+    with pytest.raises(ValueError, match=f'^{message}'):
+        function(**BROADCASTING[function] | bad)

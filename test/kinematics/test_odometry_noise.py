@@ -19,15 +19,11 @@ NONE = np.zeros((3, 3))
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
 # v, omega, duration: straight, next to straight, both sides of the series' end, spins, large turns.
 ARCS = [
-    *(
-        (v, omega, 4.0)
-        for v in (0.2, -0.2)
-        for omega in (0.0, 1e-12, -1e-6, 1e-3, 0.1, -0.2499, 0.2501, 2.0)
-    ),
-    *((0.0, omega, 4.0) for omega in (1e-12, 1e-3, -1.0, 12.5)),
-    *((v, omega, 20.0) for v in (0.3, -0.01) for omega in (2.5, -2.5)),
+    *((v, omega, 4.0) for v in (0.2, -0.2) for omega in (0.0, 1e-12, 1e-3, -0.2499, 0.2501, 2.0)),
+    *((0.0, omega, 4.0) for omega in (1e-12, -1.0, 12.5)),
+    *((v, -2.5, 20.0) for v in (0.3, -0.01)),
     *((1.0, omega, 3.0) for omega in (12.5, -12.6)),  # one wheel (almost) at rest, or backwards
-    *((0.5, 0.3, duration) for duration in (0.0, 1e-9, 1e-3)),
+    *((0.5, 0.3, duration) for duration in (0.0, 1e-9)),
 ]
 
 
@@ -80,18 +76,18 @@ def propagated(covariance, pose, twist, duration, k=K):
 # --- Identities
 
 
-@pytest.mark.parametrize('start', [NONE, COVARIANCE], ids=['sure', 'unsure'])
 @pytest.mark.parametrize(('v', 'omega', 'duration'), ARCS)
-def test_the_closed_form_is_the_integral(v, omega, duration, start):
-    actual = propagated(start, START, (v, omega), duration)
-    expected = by_quadrature(start, START, (v, omega), duration)
-    close(actual, expected)
-    assert np.array_equal(actual, actual.T)
-    deviations = np.sqrt(np.maximum(np.diag(expected), 1e-300))
-    assert np.linalg.eigvalsh(actual / np.outer(deviations, deviations)).min() >= -1e-13
+def test_the_closed_form_is_the_integral(v, omega, duration):
+    for start in (NONE, COVARIANCE):
+        actual = propagated(start, START, (v, omega), duration)
+        expected = by_quadrature(start, START, (v, omega), duration)
+        close(actual, expected)
+        assert np.array_equal(actual, actual.T)
+        deviations = np.sqrt(np.maximum(np.diag(expected), 1e-300))
+        assert np.linalg.eigvalsh(actual / np.outer(deviations, deviations)).min() >= -1e-13
 
 
-@pytest.mark.parametrize('omega', [0.0, 1e-12, -1e-6, 1e-3, 0.1])
+@pytest.mark.parametrize('omega', [1e-12, -1e-6, 1e-3])
 def test_across_a_nearly_straight_path_no_digits_are_lost(omega):
     """Along the path, x and y differ by decades: each entry is compared relative to its own size."""
     v, duration = 0.2, 4.0
@@ -144,25 +140,7 @@ def test_the_twist_covariance_is_the_density_over_the_interval(v, omega):
     assert np.array_equal(actual, actual.T)
 
 
-def test_leading_axes_broadcast():
-    rng = np.random.default_rng(1)
-    twists, durations = rng.normal(size=(4, 1, 2)), rng.uniform(0.0, 5.0, 3)
-    poses = rng.normal(size=(3, 3))
-    roots = rng.normal(size=(4, 1, 3, 3))
-    covariances = roots @ np.swapaxes(roots, -1, -2)
-    at_once = propagated(covariances, poses, twists, durations)
-    twist_at_once = twist_covariance(twists, L, K, 0.1)
-    assert at_once.shape == (4, 3, 3, 3)
-    assert twist_at_once.shape == (4, 1, 2, 2)
-    for i in range(4):
-        np.testing.assert_allclose(
-            twist_at_once[i, 0], twist_covariance(twists[i, 0], L, K, 0.1), rtol=1e-14
-        )
-        for j in range(3):
-            close(at_once[i, j], propagated(covariances[i, 0], poses[j], twists[i, 0], durations[j]))
-
-
-# --- Monte-Carlo: 20,000 noisy wheels
+# --- Monte Carlo: 5,000 noisy wheels
 
 
 def assert_same_within_sampling_error(samples, expected, standard_errors=5.0):
@@ -180,15 +158,18 @@ def assert_same_within_sampling_error(samples, expected, standard_errors=5.0):
 
 
 @pytest.mark.parametrize(
-    ('v', 'omega', 'duration'), [(0.2, 0.7, 5.0), (-0.2, 0.0, 5.0), (0.05, -3.0, 2.0), (0.0, 1.0, 3.0)]
+    ('v', 'omega', 'duration', 'start'),
+    [
+        *((0.2, 0.7, 5.0, start) for start in (NONE, 1e-4 * COVARIANCE)),
+        *((v, omega, 3.0, NONE) for v, omega in ((-0.2, 0.0), (0.05, -3.0), (0.0, 1.0))),
+    ],
 )
-@pytest.mark.parametrize('start', [NONE, 1e-4 * COVARIANCE], ids=['sure', 'unsure'])
-def test_twenty_thousand_noisy_wheels_have_the_reported_covariances(v, omega, duration, start):
-    """Each wheel's travel is perturbed in 100 sub-steps by a variance of k times its distance.
+def test_five_thousand_noisy_wheels_have_the_reported_covariances(v, omega, duration, start):
+    """Each wheel's travel is perturbed in 50 sub-steps by a variance of k times its distance.
 
     k is so small that the motion is linear in the noise to 1e-4 of it, far below the sampling error.
     """
-    count, steps, k = 20_000, 100, 1e-9
+    count, steps, k = 5_000, 50, 1e-9
     rng = np.random.default_rng(2)
     travel = np.array([v + omega * L / 2.0, v - omega * L / 2.0]) * duration
     poses = START + rng.multivariate_normal(np.zeros(3), start, count)
@@ -209,7 +190,6 @@ def test_twenty_thousand_noisy_wheels_have_the_reported_covariances(v, omega, du
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
-        ({'dt': -1.0}, 'dt must be zero or positive'),
         ({'dt': [1.0, -1.0]}, 'dt must be zero or positive'),
         ({'wheel_travel_variance': -1e-5}, 'wheel_travel_variance must be zero or positive'),
         ({'L': 0.0}, 'L must be positive'),
@@ -220,14 +200,6 @@ def test_twenty_thousand_noisy_wheels_have_the_reported_covariances(v, omega, du
     ],
 )
 def test_nothing_that_gives_negative_variances_is_accepted(changes, message):
-    valid = {
-        'covariance': np.eye(3) * 1e-4,
-        'pose': np.zeros(3),
-        'twist': (0.2, 0.1),
-        'dt': 1.0,
-        'L': 0.16,
-        'wheel_travel_variance': 1e-5,
-    }
-    assert np.all(np.linalg.eigvalsh(propagate_covariance(**valid)) > 0.0)
+    valid = {'covariance': COVARIANCE, 'pose': START, 'twist': (0.2, 0.1), 'dt': 1.0, 'L': L}
     with pytest.raises(ValueError, match=f'^{message}'):
-        propagate_covariance(**valid | changes)
+        propagate_covariance(**valid | {'wheel_travel_variance': K} | changes)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -15,8 +13,8 @@ from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 R, L = 0.033, 0.16  # document A's robot
 BATCH = (4, 5)
-links = pytest.mark.parametrize('n', [1, 2, 3, 7])
-two_links = pytest.mark.parametrize('lengths', [(1.0, 1.0), (0.3, 0.2), (2.0**0.5, 1.0), (0.01, 5.0)])
+links = pytest.mark.parametrize('n', [1, 2, 5])
+two_links = pytest.mark.parametrize('lengths', [(1.0, 1.0), (2.0**0.5, 1.0), (0.01, 5.0)])
 
 
 def close(actual, expected, tolerance=1e-12):
@@ -70,24 +68,6 @@ def test_the_tip_is_the_sum_of_complex_numbers_and_a_chain_of_rigid_motions(n):
     same_pose(pose, chain)
     assert arm.joints == n
     close(arm.joint_positions(q), np.stack(positions, axis=-2))
-
-
-def test_the_heading_is_wrapped_in_a_batch_as_it_is_alone():
-    q = np.linspace(-20.0, 20.0, 1001)
-    for turns in (q, q[np.abs(q) < 2.0 * np.pi], q[np.abs(q) < 4.0 * np.pi]):
-        heading = PlanarArm([1.0]).forward_kinematics(turns[:, np.newaxis])[:, 2]
-        close(heading, [np.angle(np.exp(1j * turn)) for turn in turns])
-        assert np.array_equal(heading, [se2.wrap_angle(float(turn)) for turn in turns])
-
-
-@links
-def test_the_jacobian_turns_the_tip_about_each_joint(n):
-    arm, q, _ = an_arm(n)
-    positions = arm.joint_positions(q)
-    levers = positions[..., -1:, :] - positions[..., :-1, :]
-    J = arm.jacobian(q, heading=True)
-    close(J, np.stack([-levers[..., 1], levers[..., 0], np.ones_like(q)], axis=-2))
-    assert np.array_equal(J[..., :2, :], arm.jacobian(q))
 
 
 @links
@@ -149,21 +129,11 @@ def test_elbow_down_and_elbow_up_put_the_tip_there_and_there_is_no_third_solutio
 
 
 @two_links
-def test_stretched_and_folded_arms_are_refused(lengths):
-    arm = PlanarArm(lengths)
-    for q in arm.singular_configurations(np.linspace(-3.1, 3.1, 100)).reshape(-1, 2):
-        with pytest.raises(np.linalg.LinAlgError, match=r'^J must not be .* got a determinant of'):
-            iv.adjugate_inverse(arm.jacobian(q))
-        with pytest.raises(np.linalg.LinAlgError, match=r'got a determinant of'):
-            arm.inverse_velocity(q, [1.0, 0.0])
-
-
-@two_links
 def test_stretched_and_folded_arms_are_refused_after_many_turns_and_folded_the_other_way(lengths):
     arm = PlanarArm(lengths)
-    for q_1 in [*np.linspace(-3.1, 3.1, 100), *np.linspace(10.0, 1000.0, 100)]:
+    for q_1 in [*np.linspace(-3.1, 3.1, 30), *np.linspace(10.0, 1000.0, 30)]:
         for q_2 in (0.0, np.pi, -np.pi):
-            with pytest.raises(np.linalg.LinAlgError):
+            with pytest.raises(np.linalg.LinAlgError, match=r'got a determinant of'):
                 arm.inverse_velocity([q_1, q_2], [1.0, 0.0])
 
 
@@ -187,17 +157,6 @@ def test_clearance_is_the_distance_of_the_nearest_of_many_points_of_the_arm():
     assert np.isclose(arm.clearance([0.0, np.pi / 2.0, 0.0], [0.6, 0.2]), 0.1)
     close(arm.clearance_gradient([0.0, np.pi / 2.0, 0.0], [0.6, 0.2]), [0.2, 0.2, 0.0])
     assert not arm.clearance_gradient([0.0, 0.0, 0.0], [0.3, 0.0]).any()  # it touches the first link
-
-
-def test_an_arm_keeps_its_lengths():
-    given = np.array([0.3, 0.2])
-    arm = PlanarArm(given)
-    given[0] = 9.0
-    assert arm.lengths.tolist() == [0.3, 0.2]
-    with pytest.raises(ValueError, match='read-only'):
-        arm.lengths[0] = 9.0
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        arm.lengths = given
 
 
 def test_joints_go_on_turning_and_one_step_is_many():
@@ -234,14 +193,14 @@ def test_null_space_motion_does_its_secondary_task_and_leaves_the_tip(aim):
         here, there = (arm.forward_kinematics(at)[:, :2] for at in (q, arm.integrate(q, q_dot, dt)))
         return norm(there - here)
 
-    q = start = np.random.default_rng(6).uniform([-1.0, 0.2, 0.2], [1.0, 1.0, 1.0], (50, 3))
-    for _ in range(300):
+    q = start = np.random.default_rng(6).uniform([-1.0, 0.2, 0.2], [1.0, 1.0, 1.0], (20, 3))
+    for _ in range(100):
         q_dot = iv.redundant(arm.jacobian(q), np.zeros(2), wish(q))
         assert np.all(tip_moved(q, q_dot, dt) <= 2.0 * norm(dt * q_dot) ** 2 + 1e-15)
         after = arm.integrate(q, q_dot, dt)
         assert np.all(better(after) >= better(q) - 1e-9)
         q = after
-    assert np.mean(better(q) - better(start)) > 1e-3
+    assert np.mean(better(q) - better(start)) > 3e-4
 
 
 def test_the_cost_of_joint_limits_is_zero_in_the_middle_and_an_eighth_at_the_limits():
@@ -261,21 +220,6 @@ def test_the_tip_of_a_mobile_manipulator_is_base_and_mount_and_arm(n):
     tip = se2.compose(se2.compose(q[..., :3], mount), robot.arm.forward_kinematics(q[..., 3:]))
     same_pose(robot.forward_kinematics(q), tip)
     assert MobileManipulator(R, L, robot.arm).mount.tolist() == [0.0, 0.0]
-
-
-@links
-def test_its_jacobian_is_the_base_with_its_lever_arm_beside_the_arm(n):
-    robot, q, _ = a_robot(n)
-    J = robot.jacobian(q, heading=True)
-    assert np.array_equal(robot.jacobian(q), J[..., :2, :])
-    for index in np.ndindex(BATCH):
-        theta, joints = q[index][2], q[index][3:]
-        turn = se2.homogeneous([0.0, 0.0, theta])
-        lever = robot.mount + robot.arm.forward_kinematics(joints)[:2]
-        derivative = se2.homogeneous([0.0, 0.0, theta + np.pi / 2.0])[:2, :2]  # R'(theta)
-        through = np.column_stack([np.eye(3)[:, :2], [*derivative @ lever, 1.0]])
-        base = through @ dd.unicycle_jacobian(theta) @ dd.wheel_to_body_jacobian(R, L)
-        close(J[index], np.column_stack([base, turn @ robot.arm.jacobian(joints, heading=True)]))
 
 
 def test_one_link_straight_ahead_is_the_offset_point():
@@ -300,29 +244,6 @@ def test_one_step_is_many_and_the_base_drives_as_if_alone(n):
     close(there[..., 3:], q[..., 3:] + q_dot[..., 2:])
 
 
-@pytest.mark.parametrize('heading', [False, True])
-def test_it_is_redundant_and_null_space_motion_leaves_the_tip(heading):
-    robot, q, wish = a_robot(3)
-    J = robot.jacobian(q, heading)
-    x_dot = np.random.default_rng(7).normal(size=J.shape[:-1])
-    assert np.all(np.linalg.matrix_rank(J) == J.shape[-2])
-    close(times(J, iv.redundant(J, x_dot, wish)), x_dot, 1e-9)
-    still, dt = iv.redundant(J, np.zeros(J.shape[-2]), wish), 1e-4
-    assert np.all(norm(still) > 1e-3)
-    change = robot.forward_kinematics(robot.integrate(q, still, dt)) - robot.forward_kinematics(q)
-    change = np.append(change[..., :2], se2.wrap_angle(change[..., 2:]) * heading, axis=-1)
-    assert np.all(norm(change) <= 2.0 * norm(dt * still) ** 2)
-
-
-def test_a_mobile_manipulator_keeps_its_mount():
-    given = np.array([0.1, 0.0])
-    robot = MobileManipulator(R, L, PlanarArm([0.2]), mount=given)
-    given[0] = 9.0
-    assert robot.mount.tolist() == [0.1, 0.0]
-    with pytest.raises(ValueError, match='read-only'):
-        robot.mount[0] = 9.0
-
-
 # --- The wheel as a contact
 
 
@@ -345,58 +266,31 @@ def test_the_point_at_the_ground_stands_still_where_the_wheel_rolls():
 
 # --- Bad input
 
-NAN, HUGE, NOT_LENGTHS = np.nan, 10**400, (0.0, -1.0, np.inf, 'a')
-ARM, LONG, ONES = PlanarArm([0.3, 0.2]), PlanarArm([1.0] * 3), {n: np.ones((2, n)) for n in (2, 4)}
-ROBOT = MobileManipulator(R, L, ARM)
-BAD = [
-    ('lengths must', PlanarArm, [[], 1.0, [[1.0]], [1.0, 0.0], [-1.0], [NAN], [1j], 'long', None]),
-    ('q must', ARM.forward_kinematics, [[0.0] * 3, 0.0, [0.0, NAN], [['a', 'b']]]),
-    ('q must', ARM.joint_positions, [[0.0], [np.inf, 0.0], [[0.0], [0.0, 1.0]]]),
-    ('q must', ARM.jacobian, [[0.0], [1j, 0.0], None]),
-    ('q must', ARM.determinant, [[0.0] * 3, [0.0, NAN]]),
-    ('q_1 must', ARM.singular_configurations, [NAN, 'a', 1j]),
-    ('determinant is for an arm of 2 links, .* 3$', LONG.determinant, [[0.0] * 3]),
-    ('inverse_kinematics is for an arm of 2 links, .* 3$', LONG.inverse_kinematics, [[0.1, 0.2]]),
-    ('position must have shape', ARM.inverse_kinematics, [[0.1] * 3, 0.1]),
-    ('position must be finite', ARM.inverse_kinematics, [[NAN, 0.0]]),
-    (
-        'position must be from 0.1 to 0.5 m away from the base, got .*',
-        ARM.inverse_kinematics,
-        [[0.5 + 1e-9, 0.0], [0.0, 0.1 - 1e-9], [[0.2, 0.2], [1e200, 1e200]]],
-    ),
-    ('inverse_velocity is for .* 2 links', lambda x: LONG.inverse_velocity([0.0] * 3, x), [[0, 1]]),
-    ('x_dot must', lambda x: ARM.inverse_velocity([0.0, 1.0], x), [[1.0] * 3, [NAN, 0.0], 'ab']),
-    ('q and x_dot must .* broadcast', lambda q: ARM.inverse_velocity(q, ONES[2]), [np.ones((3, 2))]),
-    ('obstacle must', lambda o: ARM.clearance([0.0] * 2, o), [1.0, [1.0] * 3, [NAN, 0.0], 'ab']),
-    ('obstacle must', lambda o: ARM.clearance_gradient([0.0] * 2, o), [1.0, [1.0] * 3, [NAN, 0.0]]),
-    ('wrench must', lambda w: ARM.joint_torques([0.0] * 2, w), [1.0, [1.0], [0.0] * 4, [NAN, 0.0]]),
-    ('q and wrench must .* broadcast', lambda q: ARM.joint_torques(q, ONES[2]), [np.ones((3, 2))]),
-    ('q_dot must', lambda q_dot: ARM.integrate([0.0] * 2, q_dot, 1.0), [[0.0], [NAN, 0.0]]),
-    ('dt must', lambda dt: ARM.integrate([0.0] * 2, [0.0] * 2, dt), [NAN, 'a', 1j]),
-    ('q_dot and dt must .* broadcast', lambda dt: ARM.integrate([0.0] * 2, ONES[2], dt), [np.ones(3)]),
-    ('r must', lambda r: MobileManipulator(r, L, ARM), [*NOT_LENGTHS, NAN, None, 1j, [R, R], '0.1']),
-    ('L must', lambda L: MobileManipulator(R, L, ARM), [*NOT_LENGTHS, NAN, None, 1j, [L, L], '0.1']),
-    ('mount must', lambda m: MobileManipulator(R, L, ARM, m), [1.0, [1.0], [[0, 0]], [NAN, 0.0], 'a']),
-    ('q must', ROBOT.forward_kinematics, [[0.0] * 4, [NAN] * 5, 'a']),
-    ('q must', ROBOT.jacobian, [[0.0] * 6, 0.0, [1j] * 5]),
-    ('q_dot must', lambda q_dot: ROBOT.integrate([0.0] * 5, q_dot, 1.0), [[0.0] * 5, [NAN] * 4]),
-    ('q and .* must .* broadcast', lambda q: ROBOT.integrate(q, ONES[4], 1.0), [np.ones((3, 5))]),
-    ('r must', contact.rolling_direction, [*NOT_LENGTHS, [1.0, 0.0], 1j]),
-    ('r must', lambda r: contact.wheel_contact_jacobian(0.0, r), NOT_LENGTHS),
-    ('phi must', lambda phi: contact.wheel_contact_jacobian(phi, R), [NAN, 'a', 1j]),
-    ('phi and r must .* broadcast', lambda r: contact.wheel_contact_jacobian([0.0] * 2, r), [[1.0] * 3]),
-    ('x must', lambda x: contact.wheel_contact_position(x, 0.0, R), [NAN, 'a', 1j]),
-    ('d must .* rank 1', lambda d: dd.offset_point_jacobian(0.0, R, L, d), [0, -0.0, [1.0, 0.0]]),
-    ('d must', lambda d: dd.offset_point_jacobian(0.0, R, L, d), [NAN, np.inf, 1j, 'a']),
-    ('d must', lambda d: dd.offset_point([0.0] * 3, d), [NAN, 1j, 'a', HUGE]),
-    ('pose must', lambda pose: dd.offset_point(pose, 0.1), [[0.0] * 2, [NAN] * 3, (0.0, None, 1.0)]),
-    ('r must', lambda r: dd.single_wheel_jacobian(0.0, r), NOT_LENGTHS),
-    ('theta must', lambda theta: dd.wheel_to_position_jacobian(theta, R, L), [NAN, 'a', HUGE]),
-]
-ROWS = [pytest.param(*row[:2], bad, id=f'{row[0]} {str(bad)[:15]}') for row in BAD for bad in row[2]]
+ARM, LONG = PlanarArm([0.3, 0.2]), PlanarArm([1.0] * 3)
 
 
-@pytest.mark.parametrize(('message', 'call', 'bad'), ROWS)
-def test_an_error_names_the_argument_what_was_got_and_what_is_allowed(message, call, bad):
+@pytest.mark.parametrize(
+    ('message', 'call'),
+    [
+        ('lengths must have shape', lambda: PlanarArm([])),
+        ('lengths must be positive', lambda: PlanarArm([1.0, 0.0])),
+        ('q must have shape', lambda: ARM.jacobian([0.0])),
+        ('determinant is for an arm of 2 links, .* 3$', lambda: LONG.determinant([0.0] * 3)),
+        ('inverse_kinematics is for an arm of 2 links', lambda: LONG.inverse_kinematics([0.1, 0.2])),
+        ('inverse_velocity is for an arm of 2', lambda: LONG.inverse_velocity([0.0] * 3, [0.0, 1.0])),
+        ('wrench must have shape', lambda: ARM.joint_torques([0.0] * 2, [0.0] * 4)),
+        ('mount must have shape', lambda: MobileManipulator(R, L, ARM, [[0.0, 0.0]])),
+        ('r must be positive', lambda: MobileManipulator(-R, L, ARM)),
+        ('L must be a single number', lambda: MobileManipulator(R, [L, L], ARM)),
+        ('arm must be', lambda: MobileManipulator(R, L, None)),
+        ('r must be positive', lambda: contact.rolling_direction([1.0, 0.0])),
+        ('d must .* rank 1', lambda: dd.offset_point_jacobian(0.0, R, L, [1.0, 0.0])),
+        *(
+            ('position must be from 0.1 to 0.5 m away', lambda at=at: ARM.inverse_kinematics(at))
+            for at in ([0.5 + 1e-9, 0.0], [0.0, 0.1 - 1e-9], [[0.2, 0.2], [1e200, 1e200]])
+        ),
+    ],
+)
+def test_an_error_names_the_argument_and_what_is_allowed(message, call):
     with pytest.raises(ValueError, match=f'^{message}'):
-        call(bad)
+        call()

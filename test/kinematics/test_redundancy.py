@@ -9,8 +9,8 @@ import pytest
 
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 
-COUNT = 2_000
-SHAPES = [(1, 3), (2, 2), (2, 3), (2, 7), (3, 3), (3, 4), (4, 6)]
+COUNT = 500
+SHAPES = [(1, 3), (2, 2), (2, 7), (3, 4), (4, 6)]
 ROUNDING = 1e-12
 shapes = pytest.mark.parametrize(('m', 'n'), SHAPES)
 
@@ -55,13 +55,6 @@ def nearby(rng, J):
 # --- The null space
 
 
-def test_the_secondary_velocity_does_not_move_a_task_of_full_rank():
-    J = np.array([[1.0, 0.0, 0.0], [0.0, 0.05, 0.0]])
-    q_dot = iv.redundant(J, [0.0, 0.0], [1.0, 1.0, 1.0], damping=0.1)
-    np.testing.assert_allclose(J @ q_dot, 0.0, atol=1e-15)
-    np.testing.assert_allclose(q_dot, [0.0, 0.0, 1.0], atol=1e-15)
-
-
 @shapes
 def test_nothing_leaks_where_singular_values_are_zero_or_a_tenth_of_the_damping(m, n):
     rng = np.random.default_rng(1)
@@ -95,17 +88,6 @@ def test_what_leaks_near_a_loss_of_rank_is_bounded_by_a_fortieth_of_the_damping(
     J[range(m), range(m)] = iv.FILTER * 0.3 / 2.0
     worst = J @ iv.redundant(J, np.zeros(m), np.eye(n)[0], 0.3)
     assert norm(worst) == pytest.approx(iv.FILTER * 0.3 / 4.0)
-
-
-@shapes
-def test_a_damped_redundant_solution_is_damped_least_squares_and_the_projected_secondary_velocity(m, n):
-    rng = np.random.default_rng(3)
-    J, _, damping = nearly_singular(rng, m, n)
-    x_dot, wish = rng.normal(size=(COUNT, m)), rng.normal(size=(COUNT, n))
-    expected = iv.damped_least_squares(J, x_dot, damping)
-    expected = expected + times(iv.null_space_projector(J, damping), wish)
-    tolerance = ROUNDING * (norm(x_dot) / damping**2 + norm(wish) / damping)
-    assert np.all(norm(iv.redundant(J, x_dot, wish, damping) - expected) <= tolerance)
 
 
 # --- Bounds over random pairs
@@ -185,18 +167,6 @@ def test_each_task_contributes_a_bounded_velocity_and_leaves_those_before_it_alm
         before = after
 
 
-def test_far_from_conflicts_later_tasks_do_not_move_earlier_ones_at_all():
-    rng = np.random.default_rng(7)
-    tasks = [(rng.normal(size=(COUNT, m, 6)), rng.normal(size=(COUNT, m))) for m in (2, 1, 2)]
-    alone = iv.prioritized(tasks[:1], 0.01)
-    moved = times(tasks[0][0], iv.prioritized(tasks, 0.01) - alone)
-    clear = np.linalg.svd(tasks[0][0], compute_uv=False).min(axis=1) > 0.001
-    assert clear.mean() > 0.999
-    assert norm(moved)[clear].max() < 1e-9
-    still = iv.prioritized([(tasks[0][0], np.zeros(2)), *tasks[1:]], 0.01)
-    assert norm(times(tasks[0][0], still))[clear].max() < 1e-9
-
-
 def test_damped_priorities_are_continuous_in_all_jacobians():
     """The bound adds up what the projector, the inverse and the tasks before contribute."""
     rng = np.random.default_rng(8)
@@ -220,16 +190,6 @@ def test_damped_priorities_are_continuous_in_all_jacobians():
         projector = projector + np.sqrt(2.0) / width * apart
         found = [iv.prioritized(choice[: k + 1], damping) for choice in (tasks, others)]
         assert np.all(norm(found[1] - found[0]) <= moved * (1.0 + 1e-6) + 1e-9)
-
-
-def test_damping_is_chosen_robot_by_robot():
-    rng = np.random.default_rng(9)
-    tasks = [(J[:20], x_dot[:20]) for J, x_dot in tasks_in_conflict(rng)]
-    damping = np.where(np.arange(20) % 2, 0.0, 0.1)
-    together = iv.prioritized(tasks, damping)
-    for i in range(20):
-        alone = iv.prioritized([(J[i], x_dot[i]) for J, x_dot in tasks], damping[i])
-        np.testing.assert_allclose(together[i], alone, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize('damping', [0.0, 0.1])
@@ -367,22 +327,3 @@ def test_extreme_units_give_numbers_alone_and_in_a_batch_or_an_error(J, x_dot, d
     assert np.array_equal(together[1], alone)
     zero = np.zeros(J.shape[1])
     assert np.array_equal(iv.redundant(J, x_dot, zero, damping), alone)
-
-
-def test_orthogonal_rows_of_equal_length_need_no_rotation():
-    for J in (np.eye(2), np.diag([1.0, -1.0]), [[0.0, 2.0], [2.0, 0.0]]):
-        expected = np.linalg.solve(np.asarray(J).T @ J + 0.25 * np.eye(2), np.transpose(J) @ [3.0, 4.0])
-        np.testing.assert_allclose(iv.damped_least_squares(J, [3.0, 4.0], 0.5), expected, rtol=1e-14)
-        batch = iv.damped_least_squares([J, J], [3.0, 4.0], 0.5)
-        np.testing.assert_allclose(batch, [expected, expected], rtol=1e-14)
-
-
-@pytest.mark.parametrize('m', [1, 2, 3])
-def test_single_calls_and_batches_give_the_same_but_for_rounding(m):
-    rng = np.random.default_rng(13)
-    J, _, damping = nearly_singular(rng, m, 3, 300)
-    x_dot, wish = rng.normal(size=(300, m)), rng.normal(size=(300, 3))
-    together = iv.redundant(J, x_dot, wish, damping)
-    for k, one in enumerate(zip(J, x_dot, wish, damping, strict=True)):
-        scale = norm(x_dot[k]) / damping[k] + norm(wish[k])
-        np.testing.assert_allclose(together[k], iv.redundant(*one), rtol=0.0, atol=1e-12 * scale)

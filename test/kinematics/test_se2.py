@@ -14,7 +14,7 @@ from diffdrive_jacobian.kinematics import se2
 
 TURN = 2.0 * np.pi
 EPS = np.finfo(float).eps
-deterministic = settings(deadline=None, derandomize=True)
+deterministic = settings(deadline=None, derandomize=True, max_examples=60)
 
 lengths = st.floats(-1e3, 1e3)
 # On purpose often next to zero and next to half a turn, where formulas lose digits.
@@ -157,17 +157,6 @@ def test_integrate_is_composition_with_the_exponential(pose, v, omega, dt):
     assert_same_pose(se2.integrate(reached, [v, omega], -dt), pose, tolerance)
 
 
-@settings(deterministic, max_examples=10)
-@given(poses, st.floats(-1.0, 1.0), st.floats(-2.0, 2.0), st.floats(0.0, 10.0))
-def test_one_arc_is_many_small_steps(pose, v, omega, duration):
-    here, steps = pose, 500
-    for _ in range(steps):
-        here = se2.integrate(here, (v, omega), duration / steps)
-    there = se2.integrate(pose, (v, omega), duration)
-    np.testing.assert_allclose(here[:2], there[:2], rtol=0.0, atol=1e-12 * (1.0 + np.abs(pose).max()))
-    assert abs(se2.wrap_angle(here[2] - there[2])) < 1e-12
-
-
 def test_a_minute_of_arc_is_the_closed_form_and_not_eulers():
     v, omega, duration, rate = 0.22, 0.5, 60.0, 50
     a, radius = omega * duration, v / omega
@@ -210,34 +199,28 @@ def test_full_turns_return_to_the_start(pose, v, omega, circles):
     assert abs(se2.wrap_angle(end[2] - pose[2])) <= 4.0 * np.spacing(abs(circles) * TURN)
 
 
-@pytest.mark.parametrize(('steps', 'robots'), [(100_000, 0), (1_000, 1_000)], ids=['one', 'batch'])
-def test_a_million_steps_keep_the_heading_wrapped_and_the_pose_finite(steps, robots):
-    """A hundred thousand steps of one robot, and a thousand of each of a thousand robots."""
-    dt, batch = 0.1, (robots,) if robots else ()
-    twists = np.random.default_rng(1).normal(0.0, [1.0, 5.0], (steps, *batch, 2))
-    pose, path = np.zeros((*batch, 3)), np.empty((steps, *batch, 3))
+def test_many_steps_keep_the_heading_wrapped_and_the_pose_finite():
+    """Rounding moves a heading by half an ulp of pi at most in each step."""
+    dt, steps = 0.1, 4_000
+    twists = np.random.default_rng(1).normal(0.0, [1.0, 5.0], (steps, 10, 2))
+    pose, path = np.zeros((10, 3)), np.empty((steps, 10, 3))
     for index, twist in enumerate(twists):
         path[index] = pose = se2.integrate(pose, twist, dt)
-    assert np.isfinite(path).all()
     assert path[..., 2].min() > -np.pi
     assert path[..., 2].max() <= np.pi
-    # Rounding moves the heading by half an ulp of pi per step at most. No step is longer than v dt.
-    turned = [math.fsum(turns) for turns in (twists[..., 1] * dt).reshape(steps, -1).T]
-    for heading, turn in zip(np.atleast_1d(pose[..., 2]), turned, strict=True):
-        assert abs(math.remainder(heading - turn, TURN)) < steps * EPS
+    for heading, turns in zip(pose[:, 2], (twists[..., 1] * dt).T, strict=True):
+        assert abs(math.remainder(heading - math.fsum(turns), TURN)) < steps * EPS
+    # No step is longer than v dt.
     moved = np.hypot(*np.moveaxis(np.diff(path[..., :2], axis=0), -1, 0))
-    assert np.all(moved <= np.abs(twists[1:, ..., 0] * dt) + 1e-12)
-
-
-# --- Shapes
+    assert np.all(moved <= np.abs(twists[1:, :, 0] * dt) + 1e-12)
 
 
 # --- Adjoint and the Jacobians of exp
 
 TWISTS = [
     [vx, vy, turn]
-    for vx, vy in ((0.0, 0.0), (1.5, -0.7), (100.0, 30.0))
-    for turn in (0.0, 1e-300, 1e-9, -1e-4, 0.3, -0.99, 1.01, 3.1, -6.0, 9.5)
+    for vx, vy in ((0.0, 0.0), (100.0, 30.0))
+    for turn in (0.0, 1e-300, -1e-4, -0.99, 1.01, 3.1, -6.0, 9.5)
 ]
 
 
@@ -255,23 +238,13 @@ def test_the_adjoint_carries_a_motion_into_the_world_and_is_a_homomorphism(pose,
 
 
 @pytest.mark.parametrize('twist', TWISTS, ids=str)
-def test_the_jacobians_of_exp_are_its_finite_differences(twist):
-    step = 1e-6
-    columns = []
-    for h in step * np.eye(3):
-        ahead, behind = se2.exp(twist + h), se2.exp(twist - h)
-        body = se2.log(se2.compose(se2.inverse(behind), ahead)) / (2.0 * step)
-        columns.append(body)
-    length = 1.0 + math.hypot(twist[0], twist[1])
-    right = se2.right_jacobian(twist)
-    np.testing.assert_allclose(right, np.column_stack(columns), rtol=0.0, atol=3e-9 * length)
-    # Both Jacobians describe one motion, in B and in W.
-    left = se2.left_jacobian(twist)
+def test_both_jacobians_of_exp_describe_one_motion_and_are_the_identity_along_the_twist(twist):
+    """That the right one is the derivative, test_jacobians.py shows."""
+    tolerance = 1e-13 * (1.0 + math.hypot(twist[0], twist[1]))
+    left, right = se2.left_jacobian(twist), se2.right_jacobian(twist)
     carried = se2.adjoint(se2.exp(twist)) @ right
-    np.testing.assert_allclose(left, carried, rtol=0.0, atol=1e-13 * length)
-    # Along the twist itself both are the identity.
-    np.testing.assert_allclose(left @ twist, twist, rtol=0.0, atol=1e-14 * length * 10.0)
-    np.testing.assert_allclose(right @ twist, twist, rtol=0.0, atol=1e-14 * length * 10.0)
+    np.testing.assert_allclose(left, carried, rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose([left @ twist, right @ twist], [twist] * 2, rtol=0.0, atol=tolerance)
 
 
 @pytest.mark.parametrize('turn', [1e-2, 1e-5, 1e-9, 1e-200, 0.0])
@@ -282,35 +255,3 @@ def test_the_jacobians_of_exp_lose_no_digits_near_zero(turn):
     series = sum(np.linalg.matrix_power(ad, n) / math.factorial(n + 1) for n in range(9))
     left = se2.left_jacobian([vx, vy, turn])
     np.testing.assert_allclose(left, series, rtol=1e-14, atol=1e-300)
-
-
-def test_every_function_broadcasts_over_leading_axes():
-    rng = np.random.default_rng(2)
-    a, b, twist, dt = (rng.normal(size=shape) for shape in [(4, 1, 3), (5, 3), (4, 1, 2), (5,)])
-    unary = (se2.exp, se2.log, se2.inverse, se2.homogeneous, se2.homogeneous_3d)
-    unary += (se2.adjoint, se2.left_jacobian, se2.right_jacobian)
-    held = list(zip(b, dt, strict=True))
-    for at_once, looped in [
-        *((function(b), [function(row) for row in b]) for function in unary),
-        (se2.compose(a, b), [[se2.compose(p[0], q) for q in b] for p in a]),
-        (se2.integrate(b, twist, dt), [[se2.integrate(q, u[0], t) for q, t in held] for u in twist]),
-    ]:
-        np.testing.assert_allclose(at_once, looped, rtol=1e-14, atol=1e-14)
-        assert at_once.shape == np.shape(looped)
-
-
-@pytest.mark.parametrize('bad', [0.0, [], [1.0], [1.0] * 4, np.zeros((3, 1)), np.zeros((0, 4))])
-def test_a_wrong_shape_is_named(bad):
-    pose = np.zeros(3)
-    for name, call in [
-        ('twist', lambda: se2.exp(bad)),
-        ('pose', lambda: se2.log(bad)),
-        ('first', lambda: se2.compose(bad, pose)),
-        ('second', lambda: se2.compose(pose, bad)),
-        ('pose', lambda: se2.inverse(bad)),
-        ('pose', lambda: se2.homogeneous(bad)),
-        ('pose', lambda: se2.integrate(bad, (1.0, 1.0), 1.0)),
-        ('twist', lambda: se2.integrate(pose, bad, 1.0)),
-    ]:
-        with pytest.raises(ValueError, match=rf'^{name} must have shape'):
-            call()

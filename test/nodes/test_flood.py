@@ -38,6 +38,7 @@ def world(tmp_path):
         yield world
 
 
+@pytest.mark.process
 def test_a_flooded_robot_answers_and_stops_when_the_flood_ends(world):
     robot = world.start('virtual_robot', '--ros-args', '-p', 'cmd_vel_timeout:=0.3')
     odometry = world.harness.listen(Odometry, 'odom')

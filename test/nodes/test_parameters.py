@@ -1,4 +1,4 @@
-"""Parameters: declared once, held against the files in config/, refused with the reason."""
+"""Parameters: declared once, compared with the files in config/, refused with the reason."""
 
 from __future__ import annotations
 
@@ -37,32 +37,25 @@ TYPES = {
 }
 
 
-def test_there_are_two_robots_in_config():
+def test_config_files_name_only_what_exists_agree_and_run():
     assert len(FILES) >= 2
-
-
-@pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)
-def test_config_files_name_only_what_exists_and_run(path):
-    sections = yaml.safe_load(path.read_text())
-    assert set(sections) == {f'/**/{name}' for name in NODES}
-    with ros_context(['test', '--ros-args', '--params-file', str(path)]) as context:
-        for name, (node_class, parameters) in NODES.items():
-            given = sections[f'/**/{name}']['ros__parameters']
-            known = specifications(parameters)
-            assert set(given) <= set(known)
-            node = node_class(context=context, namespace='any/where')
-            for ros_name, value in given.items():
-                assert getattr(node.parameters, known[ros_name][0]) == value
-            node.destroy_node()
-
-
-def test_config_files_agree_with_themselves():
     for path in FILES:
         sections = yaml.safe_load(path.read_text())
+        assert set(sections) == {f'/**/{name}' for name in NODES}
         robot, goal, bridge = (sections[f'/**/{name}']['ros__parameters'] for name in NODES)
         for shared in ('wheel_radius', 'wheel_separation', 'left_wheel_name', 'right_wheel_name'):
             assert robot[shared] == bridge[shared]
         assert {key: robot[key] for key in goal} == goal
+        with ros_context(['test', '--ros-args', '--params-file', str(path)]) as context:
+            for (node_class, parameters), given in zip(
+                NODES.values(), (robot, goal, bridge), strict=True
+            ):
+                known = specifications(parameters)
+                assert set(given) <= set(known)
+                node = node_class(context=context, namespace='any/where')
+                for ros_name, value in given.items():
+                    assert getattr(node.parameters, known[ros_name][0]) == value
+                node.destroy_node()
 
 
 @pytest.mark.parametrize('name', NODES)
@@ -88,32 +81,26 @@ def test_every_parameter_is_described_as_declared(add, name):
             assert '[' in specification.description, f'{ros_name} has no unit'
 
 
-@pytest.mark.parametrize(
-    ('values', 'words'),
-    [
-        ({'wheel_radius': 0.0}, "'wheel_radius' must be in [0.001, 10], got 0.0"),
-        ({'wheel_radius': math.nan}, 'got nan'),
-        ({'wheel_radius': '1'}, "'wheel_radius' must be a double (as 1.0), got '1'"),
-        ({'publish_rate': 5000.0}, "'publish_rate' must be in [0.1, 1000], got 5000.0"),
-        ({'enable_odom_tf': 1}, "'enable_odom_tf' must be a bool (true or false), got 1"),
-        ({'linear_x_max_velocity': -0.1}, "'linear.x.max_velocity' must be in [0, 1000] or .nan"),
-        ({'command_interface': 'legs'}, "must be one of 'twist', 'wheels', got 'legs'"),
-        ({'left_wheel_name': 'right_wheel_joint'}, "must differ, both are 'right_wheel_joint'"),
-    ],
-)
-def test_bad_values_cannot_exist(values, words):
-    with pytest.raises(ParameterError) as caught:
-        VirtualRobotParameters(**values)
-    assert words in str(caught.value)
+BAD = [
+    ({'wheel_radius': 0.0}, "'wheel_radius' must be in [0.001, 10], got 0.0"),
+    ({'wheel_radius': math.nan}, 'got nan'),
+    ({'wheel_radius': '1'}, "'wheel_radius' must be a double (as 1.0), got '1'"),
+    ({'publish_rate': 5000.0}, "'publish_rate' must be in [0.1, 1000], got 5000.0"),
+    ({'enable_odom_tf': 1}, "'enable_odom_tf' must be a bool (true or false), got 1"),
+    ({'linear_x_max_velocity': -0.1}, "'linear.x.max_velocity' must be in [0, 1000] or .nan"),
+    ({'command_interface': 'legs'}, "must be one of 'twist', 'wheels', got 'legs'"),
+    ({'left_wheel_name': 'right_wheel_joint'}, "must differ, both are 'right_wheel_joint'"),
+]
 
 
-def test_gains_are_positive():
+def test_bad_values_cannot_exist():
+    for values, words in BAD:
+        with pytest.raises(ParameterError) as caught:
+            VirtualRobotParameters(**values)
+        assert words in str(caught.value)
     for name in ('kp', 'kv'):
         with pytest.raises(ParameterError, match=rf"'{name}' must be in \(0, 100\], got 0.0"):
             GoToGoalParameters(**{name: 0.0})
-
-
-def test_parameters_are_frozen_and_keyword_only():
     parameters = GoToGoalParameters(kp=4.0)
     with pytest.raises(FrozenInstanceError):
         parameters.kp = 5.0
@@ -122,11 +109,20 @@ def test_parameters_are_frozen_and_keyword_only():
 
 
 def test_limits_follow_diff_drive_controller():
-    limits = VirtualRobotParameters().limits()
-    assert limits.unlimited
+    assert VirtualRobotParameters().limits().unlimited
     limits = VirtualRobotParameters(linear_x_max_velocity=0.3, angular_z_min_velocity=-1.0).limits()
     assert (limits.min_v, limits.max_v) == (-0.3, 0.3)
     assert (limits.min_omega, limits.max_omega) == (-1.0, math.inf)
+    assert VirtualRobotParameters(linear_x_max_deceleration=-1.0).model().actuators is None
+    given = VirtualRobotParameters(linear_x_max_acceleration=0.5).acceleration_limits().v
+    assert (given.max_acceleration, given.max_deceleration) == (0.5, -0.5)
+    assert (given.max_acceleration_reverse, given.max_deceleration_reverse) == (-0.5, 0.5)
+    given = VirtualRobotParameters(
+        angular_z_max_acceleration=2.0, angular_z_max_acceleration_reverse=-3.0
+    ).acceleration_limits()
+    assert given.omega.max_deceleration == -3.0
+    assert given.omega.max_deceleration_reverse == 2.0
+    assert given.v.unlimited
 
 
 def test_a_refused_start_leaves_no_node(lockstep, add):
@@ -163,26 +159,17 @@ def test_quality_of_service_can_be_overridden(add):
     assert info.qos_profile.reliability.name == 'BEST_EFFORT'
     (info,) = node.get_publishers_info_by_topic('/joint_states')
     assert info.qos_profile.reliability.name == 'RELIABLE'
-
-
-@pytest.mark.parametrize(
-    ('override', 'value'),
-    [
-        ('publisher.depth', 2**63 - 1),
-        ('publisher.depth', 2**31),
-        ('publisher.depth', -(2**63)),
-        ('publisher.depth', -1),
-        ('publisher.history', 'keep_none'),
-        ('publisher.reliability', ''),
-    ],
-)
-def test_invalid_overrides_of_the_quality_of_service_are_reported(add, override, value):
-    with pytest.raises(ParameterError) as caught:
-        add(VirtualRobot, **{f'qos_overrides./odom.{override}': value})
-    message = str(caught.value)
-    assert message.startswith('the qos_overrides of /odom are invalid: ')
-    assert message.endswith(f'(got {override}: {value})')
-    assert '\n' not in message
+    for override, value in (
+        *(('depth', depth) for depth in (2**63 - 1, 2**31, -(2**63), -1)),
+        ('history', 'keep_none'),
+        ('reliability', ''),
+    ):
+        with pytest.raises(ParameterError) as caught:
+            add(VirtualRobot, **{f'qos_overrides./odom.publisher.{override}': value})
+        message = str(caught.value)
+        assert message.startswith('the qos_overrides of /odom are invalid: ')
+        assert message.endswith(f'(got publisher.{override}: {value})')
+        assert '\n' not in message
 
 
 def test_two_topics_of_a_node_with_one_name_are_reported(ros):
@@ -204,16 +191,3 @@ def test_the_last_word_counts(tmp_path):
         assert node.parameters.kp == node.get_parameter('kp').value == 7.0
         assert node.parameters.xy_goal_tolerance == 0.1
         node.destroy_node()
-
-
-def test_limits_of_the_acceleration_default_as_in_diff_drive_controller():
-    assert VirtualRobotParameters(linear_x_max_deceleration=-1.0).model().actuators is None
-    given = VirtualRobotParameters(linear_x_max_acceleration=0.5).acceleration_limits().v
-    assert (given.max_acceleration, given.max_deceleration) == (0.5, -0.5)
-    assert (given.max_acceleration_reverse, given.max_deceleration_reverse) == (-0.5, 0.5)
-    given = VirtualRobotParameters(
-        angular_z_max_acceleration=2.0, angular_z_max_acceleration_reverse=-3.0
-    ).acceleration_limits()
-    assert given.omega.max_deceleration == -3.0
-    assert given.omega.max_deceleration_reverse == 2.0
-    assert given.v.unlimited

@@ -7,8 +7,6 @@ import math
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import SECOND, Topics, change, comes_after
@@ -16,7 +14,6 @@ from support.ros_messages import covariance_of, instants, pose_message, pose_of,
 
 from diffdrive_jacobian.control import VelocityLimits, saturate
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
 
 LIMITS = {
@@ -29,16 +26,6 @@ LIMITS = {
     'turning': ({'angular__z__max_velocity': 1.0}, {'min_omega': -1.0, 'max_omega': 1.0}),
     'clockwise': ({'angular__z__min_velocity': -0.5}, {'min_omega': -0.5}),
     'wheels': ({'max_wheel_velocity': 9.0}, {'max_wheel_speed': 9.0}),
-    'all': (
-        {
-            'linear__x__max_velocity': 0.4,
-            'linear__x__min_velocity': -0.2,
-            'angular__z__max_velocity': 1.5,
-            'angular__z__min_velocity': -2.0,
-            'max_wheel_velocity': 10.0,
-        },
-        {'max_v': 0.4, 'min_v': -0.2, 'max_omega': 1.5, 'min_omega': -2.0, 'max_wheel_speed': 10.0},
-    ),
 }
 
 
@@ -51,48 +38,37 @@ def driving(lockstep, robot_at):
     return topics
 
 
-@pytest.mark.parametrize('command', [(1.0, 3.0), (-1.0, 3.0), (-1.0, -3.0)], ids=str)
 @pytest.mark.parametrize('name', LIMITS)
-def test_limits_hold_and_keep_the_curvature(lockstep, robot_at, name, command):
+def test_limits_keep_the_curvature_hold_for_the_running_command_and_let_it_go_again(
+    lockstep, robot_at, name
+):
     parameters, limits = LIMITS[name]
-    topics = Topics(lockstep)
-    robot_at(**parameters)
-    lockstep.publish('cmd_vel', twist(*command))
-    lockstep.run_for(0.3)
-    expected = saturate(*command, VelocityLimits(**limits), 0.033, 0.16)
-    assert twists(topics.applied) == [expected]
-    # What saturation does is tested elsewhere; that the limits hold, here once more.
-    v, omega = expected
-    assert limits.get('min_v', -math.inf) <= v <= limits.get('max_v', math.inf)
-    assert limits.get('min_omega', -math.inf) <= omega <= limits.get('max_omega', math.inf)
-    assert max(map(abs, body_to_wheel(v, omega, 0.033, 0.16))) <= limits.get(
-        'max_wheel_speed', math.inf
-    ) * (1.0 + 1e-15)
-    assert v * command[1] == pytest.approx(omega * command[0], rel=1e-15) or v == 0.0
-    assert topics.odom[-1].pose.pose == pose_message(se2.integrate(3 * [0.0], expected, 0.3))
-    assert topics.odom[-1].twist.twist == twist(*expected)
-
-
-@pytest.mark.parametrize('name', LIMITS)
-def test_new_limits_hold_for_the_running_command_and_let_it_go_again(lockstep, robot_at, name):
-    parameters, limits = LIMITS[name]
-    topics = Topics(lockstep)
-    robot = robot_at()
-    lockstep.publish('cmd_vel', twist(-1.0, -3.0))
-    lockstep.run_for(0.2)
-    assert change(robot, **parameters).successful
-    lockstep.run_for(0.2)
-    assert change(robot, **dict.fromkeys(parameters, math.nan)).successful
+    limits, topics = VelocityLimits(**limits), Topics(lockstep)
+    robot = robot_at(**parameters)
+    for command in ((1.0, 3.0), (-1.0, 3.0)):
+        lockstep.publish('cmd_vel', twist(*command))
+        assert twists(topics.applied)[-1] == saturate(*command, limits, 0.033, 0.16)
+    # Live: none, these, none again.
+    pose, begin = pose_of(topics.starts[-1]), lockstep.now
+    full, limited = (-1.0, -3.0), saturate(-1.0, -3.0, limits, 0.033, 0.16)
+    none = dict.fromkeys(parameters, math.nan)
+    assert change(robot, **none).successful
+    lockstep.settle()
+    topics.applied.clear()
+    lockstep.publish('cmd_vel', twist(*full))
+    for values in (parameters, none):
+        lockstep.run_for(0.2)
+        assert change(robot, **values).successful
     lockstep.run_for(1.0)
-    full, limited = (-1.0, -3.0), saturate(-1.0, -3.0, VelocityLimits(**limits), 0.033, 0.16)
-    tenths = [1 * SECOND, 1_200_000_000, 1_400_000_000, 1_500_000_000]
+    tenths = [begin, begin + SECOND // 5, begin + 2 * (SECOND // 5), begin + SECOND // 2]
     told = list(zip(instants(topics.applied), twists(topics.applied), strict=True))
     if limited == full:
         assert told == [(tenths[0], full), (tenths[3], (0.0, 0.0))]
     else:
         assert told == list(zip(tenths, [full, limited, full, (0.0, 0.0)], strict=True))
-    pose = se2.integrate(se2.integrate(3 * [0.0], full, 0.2), limited, 0.2)
-    assert topics.odom[-1].pose.pose == pose_message(se2.integrate(pose, full, 0.1))
+    for command, seconds in ((full, 0.2), (limited, 0.2), (full, 0.1)):
+        pose = se2.integrate(pose, command, seconds)
+    assert topics.odom[-1].pose.pose == pose_message(pose)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +84,7 @@ def test_timeout_changes_for_the_running_command(lockstep, driving, timeout, str
     assert pose_of(driving.odom[-1])[0] == pytest.approx(strikes or 3.0, abs=1e-15)
 
 
-@pytest.mark.parametrize('rate', [0.5, 10.0, 50.5, 1000.0])
+@pytest.mark.parametrize('rate', [0.5, 50.5, 1000.0])
 def test_rate_changes_at_once(lockstep, driving, rate):
     lockstep.run_for(0.013)
     changed, period = lockstep.now, round(SECOND / rate)
@@ -122,31 +98,13 @@ def test_rate_changes_at_once(lockstep, driving, rate):
     assert len(expected) in (5, 6)
 
 
-@pytest.mark.parametrize('pause', [0.001, 0.009, 0.01])
+@pytest.mark.parametrize('pause', [0.001, 0.01])
 def test_rate_that_keeps_changing_starves_nobody(lockstep, driving, pause):
     driving.odom.clear()
     for rate in itertools.islice(itertools.cycle([21.0, 20.0]), 100):
         change(driving.robot, publish_rate=rate)
         lockstep.run_for(pause)
     assert len(driving.odom) >= math.floor(100 * pause * 20)
-
-
-@pytest.mark.parametrize(('radius', 'separation'), [(0.066, 0.16), (0.033, 0.4), (0.1, 0.08)])
-def test_other_wheels_turn_otherwise_and_the_robot_drives_on(lockstep, robot_at, radius, separation):
-    topics = Topics(lockstep)
-    robot = robot_at()
-    lockstep.publish('cmd_vel', twist(1.0, 2.0))
-    lockstep.run_for(0.2)
-    assert change(robot, wheel_radius=radius, wheel_separation=separation).successful
-    lockstep.run_for(0.2)
-    right, left = body_to_wheel(1.0, 2.0, radius, separation)
-    assert list(topics.states[-1].velocity) == [left, right]
-    before = body_to_wheel(1.0, 2.0, 0.033, 0.16)
-    assert list(topics.states[-1].position) == pytest.approx(
-        [0.2 * before[1] + 0.2 * left, 0.2 * before[0] + 0.2 * right], rel=1e-14
-    )
-    assert pose_of(topics.odom[-1]) == pytest.approx(se2.integrate([0, 0, 0], [1, 2], 0.4), abs=1e-15)
-    assert len(topics.applied) == 1
 
 
 def test_initial_pose_counts_from_the_next_reset_on(lockstep, driving):
@@ -169,7 +127,7 @@ def test_names_change_with_the_next_message(lockstep, driving):
     assert driving.applied[-1].header.frame_id == 'b'
 
 
-@pytest.mark.parametrize('variance', [0.0, 1e-5, 1e-3, 1.0])
+@pytest.mark.parametrize('variance', [0.0, 1e-5, 1.0])
 def test_uncertainty_grows_with_the_variance_of_the_wheels(lockstep, robot_at, variance):
     topics = Topics(lockstep)
     robot = robot_at(wheel_travel_variance=0.0)
@@ -188,54 +146,37 @@ def test_uncertainty_grows_with_the_variance_of_the_wheels(lockstep, robot_at, v
     assert covariance == pytest.approx(expected, rel=1e-9, abs=1e-16)
 
 
-@pytest.mark.parametrize(
-    ('changes', 'words'),
-    [
-        ({'wheel_radius': 0.0}, 'wheel_radius'),
-        ({'wheel_radius': math.nan}, 'wheel_radius'),
-        ({'wheel_radius': 'big'}, 'expected'),
-        ({'linear__x__max_velocity': -1.0}, "'linear.x.max_velocity' must be in [0, 1000]"),
-        ({'linear__x__min_velocity': 0.5}, 'got 0.5'),
-        ({'max_wheel_velocity': math.inf}, 'or .nan for none'),
-        ({'base_frame_id': ''}, "'base_frame_id' must be not empty"),
-        ({'base_frame_id': 'odom'}, 'must differ'),
-        ({'command_interface': 'wheels'}, 'read-only'),
-        ({'publish_rate': 2000.0}, 'publish_rate'),
-        ({'wheel_separation': 1.0, 'cmd_vel_timeout': -1.0}, 'cmd_vel_timeout'),
-    ],
-)
-def test_bad_changes_are_refused_with_the_reason_and_change_nothing(lockstep, driving, changes, words):
+BAD = [
+    ({'wheel_radius': 0.0}, 'wheel_radius'),
+    ({'wheel_radius': math.nan}, 'wheel_radius'),
+    ({'wheel_radius': 'big'}, 'expected'),
+    ({'linear__x__max_velocity': -1.0}, "'linear.x.max_velocity' must be in [0, 1000]"),
+    ({'linear__x__min_velocity': 0.5}, 'got 0.5'),
+    ({'max_wheel_velocity': math.inf}, 'or .nan for none'),
+    ({'base_frame_id': ''}, "'base_frame_id' must be not empty"),
+    ({'base_frame_id': 'odom'}, 'must differ'),
+    ({'command_interface': 'wheels'}, 'read-only'),
+    ({'publish_rate': 2000.0}, 'publish_rate'),
+    ({'wheel_separation': 1.0, 'cmd_vel_timeout': -1.0}, 'cmd_vel_timeout'),
+]
+
+
+def test_bad_changes_are_refused_with_the_reason_and_change_nothing(lockstep, driving):
     before = driving.robot.parameters
     lockstep.run_for(0.2)
-    result = change(driving.robot, **changes)
-    assert not result.successful
-    assert words in result.reason
-    assert driving.robot.parameters is before
+    for changes, words in BAD:
+        result = change(driving.robot, **changes)
+        assert not result.successful
+        assert words in result.reason
+        assert driving.robot.parameters is before
     lockstep.run_for(0.32)
     assert instants(driving.applied) == [SECOND, SECOND + SECOND // 2]
     assert pose_of(driving.odom[-1]).tolist() == [0.5, 0.0, 0.0]
 
 
-def test_integers_are_taken_for_doubles_and_strangers_are_left_alone(driving):
+def test_integers_are_taken_for_doubles_and_other_parameters_are_left_alone(driving):
     assert driving.robot.set_parameters([Parameter('wheel_separation', value=1)])[0].successful
     assert driving.robot.parameters.wheel_separation == 1.0
     assert driving.robot.get_parameter('wheel_separation').value == 1.0
     driving.robot.declare_parameter('foreign', 3)
     assert driving.robot.set_parameters([Parameter('foreign', value=4)])[0].successful
-
-
-def test_a_rounded_covariance_does_not_grow_into_a_negative_variance(lockstep, robot_at):
-    """Variances that are slightly negative would grow with the distance, and end the node later."""
-    robot = robot_at(cmd_vel_timeout=0.0, wheel_travel_variance=0.0)
-    odometry = lockstep.listen(Odometry, 'odom')
-    message = PoseWithCovarianceStamped()
-    message.pose.pose.orientation.w = 1.0
-    message.pose.covariance[0] = message.pose.covariance[7] = 1.0
-    message.pose.covariance[35] = -9e-10
-    lockstep.publish('initialpose', message)
-    lockstep.publish('cmd_vel', twist(10.0, 0.0))
-    lockstep.jump(6e4)
-    lockstep.run_for(0.1)
-    assert robot.set_parameters([Parameter('wheel_radius', value=0.04)])[0].successful
-    lockstep.run_for(0.1)
-    assert min(np.diag(np.reshape(odometry[-1].pose.covariance, (6, 6)))) >= 0.0

@@ -17,35 +17,24 @@ from diffdrive_jacobian.simulation.slip import Drift
 SECOND = 1_000_000_000
 REAL = np.longdouble
 L = 0.16
-V = {
-    'max_acceleration': 0.5,
-    'max_deceleration': -0.8,
-    'max_acceleration_reverse': -0.3,
-    'max_deceleration_reverse': 0.6,
-}
-OMEGA = {
-    'max_acceleration': 2.0,
-    'max_deceleration': -3.0,
-    'max_acceleration_reverse': -2.5,
-    'max_deceleration_reverse': 3.5,
-}
+RATES = (
+    *('max_acceleration', 'max_deceleration'),
+    *('max_acceleration_reverse', 'max_deceleration_reverse'),
+)
+V = dict(zip(RATES, (0.5, -0.8, -0.3, 0.6), strict=True))
+OMEGA = dict(zip(RATES, (2.0, -3.0, -2.5, 3.5), strict=True))
 
 
 def limits(**more):
     return AccelerationLimits(v=AxisLimits(**V), omega=AxisLimits(**OMEGA), **more)
 
 
-def at_rest(pose=(0.0, 0.0, 0.0), stamp=0, **model):
-    actuators = {
-        name: model.pop(name)
-        for name in ('acceleration', 'lag', 'delay', 'max_right_speed')
-        if name in model
-    }
-    return Robot(
-        model=RobotModel(wheel_separation=L, actuators=Actuators(**actuators), **model),
-        stamp=stamp,
-        pose=pose,
-    )
+def at_rest(**options):
+    """A robot; acceleration limits, lag and delay are those of its actuators."""
+    of_actuators = {'acceleration', 'lag', 'delay', 'max_right_speed'} & {*options}
+    actuators = Actuators(**{name: options.pop(name) for name in of_actuators})
+    model = RobotModel(wheel_separation=L, actuators=actuators, **options)
+    return Robot(model=model, stamp=0, pose=(0.0, 0.0, 0.0))
 
 
 def close(one, other, tolerance=1e-12):
@@ -141,7 +130,7 @@ def driven(pose, u, slope, y, seconds, tau):
 @pytest.mark.parametrize('tau', [0.0, 0.05, 0.3])
 def test_the_pose_is_that_of_an_integration_in_extended_precision(tau):
     rng = np.random.default_rng(31)
-    for _ in range(334):
+    for _ in range(15):
         times = np.sort(rng.integers(0, 8 * SECOND, 6))
         times[0] = 0
         twists = np.round(rng.uniform((-0.5, -2.0), (0.5, 2.0), (6, 2)), 3)
@@ -198,10 +187,10 @@ def test_no_acceleration_exceeds_its_limit_nor_does_that_of_a_wheel():
     model = {'acceleration': limits(max_wheel_acceleration=12.0)}
     robot, stamp = at_rest(**model), 0
     at_limit = 0
-    for _ in range(200):
+    for _ in range(50):
         robot = robot.commanded(rng.uniform((-0.5, -2.0), (0.5, 2.0)), stamp)
         stamp += int(rng.integers(1, SECOND))
-        times = np.linspace(robot.stamp, stamp, 20).astype(int).tolist()
+        times = np.linspace(robot.stamp, stamp, 15).astype(int).tolist()
         for one, other in pairwise(robot.at(time) for time in times):
             dt = (other.stamp - one.stamp) / SECOND
             if not dt:
@@ -216,7 +205,7 @@ def test_no_acceleration_exceeds_its_limit_nor_does_that_of_a_wheel():
             assert max(shares) < 1.0 + 1e-6
             at_limit += max(shares) > 0.999
     # As fast as the limits allow.
-    assert at_limit > 300
+    assert at_limit > 75
 
 
 def test_a_delay_shifts_the_motion_of_the_motors_and_nothing_else():
@@ -224,7 +213,7 @@ def test_a_delay_shifts_the_motion_of_the_motors_and_nothing_else():
     plain = at_rest(acceleration=limits(), lag=0.1)
     late = at_rest(acceleration=limits(), lag=0.1, delay=delay)
     # Commands come faster than the delay.
-    for number in range(30):
+    for number in range(12):
         twist = (0.4 * math.sin(number), math.cos(number))
         stamp = SECOND + number * 50_000_000
         plain, late = plain.commanded(twist, stamp + delay), late.commanded(twist, stamp)
@@ -286,12 +275,12 @@ def test_the_moments_are_those_of_many_short_arcs():
             short = short.commanded(twist, time)
         return np.array(short.at(end).covariance_tuple)
 
-    coarse, fine = by_arcs(2_000_000), by_arcs(1_000_000)
+    coarse, fine = by_arcs(20_000_000), by_arcs(10_000_000)
     extrapolated = fine + (fine - coarse) / 3.0
     found = np.array(robot.at(end).covariance_tuple)
     scale = np.sqrt(np.outer(*[found[[0, 4, 8]]] * 2)).ravel()
-    assert (np.abs(found - fine) / scale).max() < 5e-6
-    assert (np.abs(found - extrapolated) / scale).max() < 5e-7
+    assert (np.abs(found - fine) / scale).max() < 5e-4
+    assert (np.abs(found - extrapolated) / scale).max() < 5e-5
 
 
 def test_the_moments_of_a_part_and_the_rest_are_those_of_the_whole():
@@ -314,13 +303,13 @@ def test_true_wheels_without_slip_drive_the_same_motion_with_their_geometry():
 
 def test_slip_with_varying_speeds_has_the_variance_of_the_distance():
     k, distances = 1e-4, []
-    for seed in range(300):
+    for seed in range(80):
         robot = at_rest(acceleration=limits(), drift=Drift(seed=seed), wheel_travel_variance=k)
         end = robot.commanded((0.4, 0.0), 0).at(3 * SECOND)
         distances.append(end.true_pose[0] - end.pose[0])
         rolled = end.wheel_angles[0] * 0.033
     # Two wheels with k rolled each, their mean; less what the heading takes.
-    assert np.var(distances) == pytest.approx(k * rolled / 2.0, rel=0.25)
+    assert np.var(distances) == pytest.approx(k * rolled / 2.0, rel=0.5)
 
 
 def test_a_timeout_stops_by_deceleration():
@@ -349,7 +338,7 @@ def test_one_speed_is_that_of_diff_drive_controller_at_the_ends_of_its_cycles(ax
     """But where the sign changes: there it takes the limit of the old sign to the end of the cycle."""
     rng, robot, cycle, command = np.random.default_rng(9), at_rest(acceleration=limits()), 0.02, 0.0
     compared = {'rising': 0, 'crossing': 0}
-    for number in range(3000):
+    for number in range(900):
         stamp = number * SECOND // 50
         if number % 30 == 0:
             command = round(rng.uniform(-0.6, 0.6) * (axis + 1), 2)
@@ -363,8 +352,8 @@ def test_one_speed_is_that_of_diff_drive_controller_at_the_ends_of_its_cycles(ax
         else:
             compared['rising'] += after != before
             assert after == pytest.approx(theirs, abs=1e-12)
-    assert compared['rising'] > 800
-    assert compared['crossing'] > 10
+    assert compared['rising'] > 240
+    assert compared['crossing'] > 3
 
 
 def test_without_limits_the_rates_are_infinite():
@@ -375,17 +364,11 @@ def test_without_limits_the_rates_are_infinite():
         assert robot.at(SECOND).pose_tuple == plain.at(SECOND).pose_tuple
 
 
-@pytest.mark.parametrize(
-    ('name', 'value'),
-    [
-        ('max_acceleration', -0.1),
-        ('max_acceleration', 0.0),
-        ('max_deceleration', 0.1),
-        ('max_deceleration', math.nan),
-        ('max_acceleration_reverse', 0.0),
-        ('max_deceleration_reverse', 'x'),
-    ],
-)
-def test_limits_with_the_wrong_sign_are_refused(name, value):
-    with pytest.raises(ValueError, match=name):
-        AxisLimits(**{name: value})
+def test_limits_with_the_wrong_sign_are_refused():
+    for name, value in (
+        *(('max_acceleration', bad) for bad in (-0.1, 0.0)),
+        *(('max_deceleration', bad) for bad in (0.1, math.nan)),
+        *(('max_acceleration_reverse', 0.0), ('max_deceleration_reverse', 'x')),
+    ):
+        with pytest.raises(ValueError, match=name):
+            AxisLimits(**{name: value})

@@ -30,14 +30,14 @@ SURE = gaussian(NONE)
 SECOND = 10**9
 # v, omega, duration: straight, both sides of the series' end, in place, one wheel at rest, long.
 ARCS = [
-    *((v, omega, 4.0) for v in (0.2, -0.2) for omega in (0.0, 1e-12, -1e-6, 1e-3, 0.0124, -0.0126, 2.0)),
-    *((0.0, omega, 4.0) for omega in (1e-12, 1e-3, -1.0)),
-    *((0.08, 1.0, duration) for duration in (1e-9, 1e-3, 0.02, 0.0499, 0.0501, 5.0)),
+    *((0.2, omega, 4.0) for omega in (0.0, 1e-12, -1e-6, 0.0124, -0.0126, 2.0)),
+    *((-0.2, omega, 4.0) for omega in (0.0, 1e-3)),
+    *((0.0, omega, 4.0) for omega in (1e-12, -1.0)),
+    *((0.08, 1.0, duration) for duration in (1e-9, 0.02, 0.0499, 0.0501, 5.0)),
     *((0.22, omega, 300.0) for omega in (0.0, 1e-4, 0.5)),
-    (0.22, 0.0, 1e-9),
-    (0.0, 0.0, 1.0),
+    *((0.22, 0.0, 1e-9), (0.0, 0.0, 1.0)),
 ]
-STARTS = {'sure': NONE, 'unsure': COVARIANCE, 'heading': np.diag([0.0, 0.0, 1.0])}
+STARTS = (NONE, COVARIANCE, np.diag([0.0, 0.0, 1.0]))
 
 
 def scales(moments):
@@ -68,22 +68,19 @@ def positive_semidefinite(moment, tolerance=1e-12):
 # --- Identities
 
 
-@pytest.mark.parametrize('k', [K, 1e-2])
-@pytest.mark.parametrize('start', STARTS.values(), ids=STARTS)
 @pytest.mark.parametrize(('v', 'omega', 'duration'), ARCS)
-def test_the_closed_form_solves_the_differential_equation(v, omega, duration, start, k):
+def test_the_closed_form_solves_the_differential_equation(v, omega, duration):
     """A matrix exponential in extended precision is the reference."""
-    actual = propagate_moments(gaussian(start), START, (v, omega), duration, L, k)
-    close(actual, reference(gaussian(start), START[2], (v, omega), duration, L, k))
-    positive_semidefinite(actual.second_moment)
+    for start, k in itertools.product(STARTS, (K, 1e-2)):
+        actual = propagate_moments(gaussian(start), START, (v, omega), duration, L, k)
+        close(actual, reference(gaussian(start), START[2], (v, omega), duration, L, k))
+        positive_semidefinite(actual.second_moment)
 
 
-@pytest.mark.parametrize('k', [0.0, K, 1e-2])
-@pytest.mark.parametrize('start', STARTS.values(), ids=STARTS)
 @pytest.mark.parametrize(('v', 'omega', 'duration'), ARCS)
-def test_an_arc_in_pieces_has_the_moments_of_the_whole(v, omega, duration, start, k):
-    whole = propagate_moments(gaussian(start), START, (v, omega), duration, L, k)
-    for share in (1e-6, 0.3, 0.9):
+def test_an_arc_in_pieces_has_the_moments_of_the_whole(v, omega, duration):
+    for start, k, share in itertools.product(STARTS, (0.0, K), (1e-6, 0.9)):
+        whole = propagate_moments(gaussian(start), START, (v, omega), duration, L, k)
         halfway = propagate_moments(gaussian(start), START, (v, omega), share * duration, L, k)
         pose = integrate(START, (v, omega), share * duration)
         close(propagate_moments(halfway, pose, (v, omega), (1.0 - share) * duration, L, k), whole)
@@ -100,9 +97,9 @@ def test_for_small_noise_it_is_the_first_order_form(v, omega, duration):
         assert np.all(error <= 1e-7 * np.outer(deviations, deviations))
 
 
-@pytest.mark.parametrize('m', [SHORT_NOISE, 0.1 * SHORT_NOISE, 1e-9])
-@pytest.mark.parametrize('turn', [SHORT_TURN, -SHORT_TURN, 0.2 * SHORT_TURN, 1e-6, 0.0])
-@pytest.mark.parametrize('alpha', [0.0, 1e-3, -0.1, 2.0, -100.0])
+@pytest.mark.parametrize('m', [SHORT_NOISE, 1e-9])
+@pytest.mark.parametrize('turn', [SHORT_TURN, -SHORT_TURN, 1e-6, 0.0])
+@pytest.mark.parametrize('alpha', [0.0, -0.1, -100.0])
 def test_the_short_form_is_the_series_up_to_its_limits(m, turn, alpha):
     """With wheels one metre apart, `nu = m / 2` and `|beta| <= m`; alpha is a multiple of that."""
     nu, to_end = m / 2.0, complex(math.cos(turn / 2.0), -math.sin(turn / 2.0))
@@ -121,12 +118,12 @@ def test_the_short_form_is_the_series_up_to_its_limits(m, turn, alpha):
 
 
 @pytest.mark.parametrize('side', [0.999999, 1.000001])
-@pytest.mark.parametrize(('v', 'omega'), [(0.2, 1.0), (0.08, -1.0), (0.0, 2.0), (0.2, 0.0), (-0.2, 0.1)])
+@pytest.mark.parametrize(('v', 'omega'), [(0.2, 1.0), (0.0, 2.0), (-0.2, 0.0)])
 def test_on_both_sides_of_the_limits_of_the_short_form_the_moments_are_exact(v, omega, side):
     duration = side * SHORT_TURN / abs(omega or 1.0)
     rate = (abs(v + omega * L / 2.0) + abs(v - omega * L / 2.0)) / (2.0 * L * L)
     for k in (0.5 * SHORT_NOISE / rate / duration, SHORT_NOISE / rate / duration * side):
-        for start in STARTS.values():
+        for start in STARTS:
             actual = propagate_moments(gaussian(start), START, (v, omega), duration, L, k)
             expected = reference(gaussian(start), START[2], (v, omega), duration, L, k)
             close(actual, expected, tolerance=2e-13)
@@ -179,15 +176,6 @@ def test_the_first_million_metres_are_positive_semidefinite():
             positive_semidefinite(moments.second_moment)
 
 
-@pytest.mark.parametrize('name', ['moments', 'pose', 'twist', 'dt', 'L', 'wheel_travel_variance'])
-@pytest.mark.parametrize('bad', [math.nan, 'text', None, [[1.0, 2.0]]])
-def test_a_wrong_argument_is_named(name, bad):
-    valid = {'moments': SURE, 'pose': START, 'twist': (0.2, 0.1), 'dt': 1.0, 'L': L}
-    valid['wheel_travel_variance'] = K
-    with pytest.raises(ValueError, match=rf'\b{name}\b'):
-        propagate_moments(**valid | {name: bad})
-
-
 def test_what_overflows_raises_an_error():
     with pytest.raises(ValueError, match='overflows'):
         propagate_moments(SURE, START, (1e200, 0.0), 1e10, L, K)
@@ -200,10 +188,13 @@ def test_what_overflows_raises_an_error():
 # --- Monte Carlo
 
 
-@pytest.mark.parametrize('start', [NONE, COVARIANCE], ids=['sure', 'unsure'])
-@pytest.mark.parametrize('drive', [drive(60.0) for drive in DRIVES.values()], ids=DRIVES)
-def test_the_moments_are_those_of_four_thousand_noisy_runs(drive, start):
-    count = 4000
+@pytest.mark.parametrize(
+    ('drive', 'start'),
+    [*zip([drive(60.0) for drive in DRIVES.values()], [NONE, COVARIANCE] * 2, strict=True)],
+    ids=DRIVES,
+)
+def test_the_moments_are_those_of_two_thousand_noisy_runs(drive, start):
+    count = 2000
     moments, pose = gaussian(start), np.zeros(3)
     for twist, duration in drive:
         moments = propagate_moments(moments, pose, twist, duration, L, K)
@@ -228,7 +219,7 @@ def test_the_moments_are_those_of_four_thousand_noisy_runs(drive, start):
 
 def test_the_first_order_form_is_too_small_after_a_minute():
     """What the exact moments are for: 5 times too small, NEES 45 instead of 3."""
-    count, drive = 4000, DRIVES['straight'](60.0)
+    count, drive = 500, DRIVES['straight'](60.0)
     errors = noisy_runs(np.random.default_rng(8), drive, NONE, count, L, K)
     first = propagate_covariance(NONE, np.zeros(3), *drive[0], L, K)
     assert errors[:, 0].std() > 4.0 * math.sqrt(first[0, 0])

@@ -91,20 +91,6 @@ def test_a_robot_that_assumes_its_true_dimensions_is_where_its_odometry_says(loc
     assert list(topics.states[-1].velocity) == pytest.approx([left / 0.033, right / 0.033])
 
 
-def test_wrongly_assumed_dimensions_are_the_inverse_of_wrong_true_ones(lockstep, robot_at):
-    robot = robot_at(**ASSUMED)
-    lockstep.publish('cmd_vel', twist(0.2, 0.5))
-    lockstep.run_for(0.4)
-    drift = Drift(
-        right_wheel_radius_multiplier=1.0 / 1.02,
-        left_wheel_radius_multiplier=1.0 / 0.99,
-        wheel_separation_multiplier=1.0 / 1.05,
-    )
-    model = RobotModel(wheel_separation=0.16 * 1.05, drift=drift)
-    start = Robot(model=model, stamp=0, pose=[0.0, 0.0, 0.0]).commanded((0.2, 0.5), 0)
-    assert robot.truth == pytest.approx(start.at(2 * SECOND // 5).true_pose, abs=1e-14)
-
-
 def test_assumed_dimensions_can_change_during_a_drive(lockstep, robot_at):
     """From then on the truth agrees with the odometry, up to where the robot is by then."""
     topics, truths = Topics(lockstep), lockstep.listen(Odometry, 'ground_truth')
@@ -153,14 +139,13 @@ def test_the_same_stamped_commands_give_the_same_truth_at_each_publish_rate():
     """Bit for bit, except for messages that were sent before a late command came."""
     odometry, truth = drive(10.0)
     last = SECOND + round(0.6 * SECOND)
-    for rate in (50.0, 250.0):
-        other_odometry, other = drive(rate)
-        common = [stamp for stamp in sorted(truth.keys() & other.keys()) if stamp >= last]
-        assert len(common) >= 9
-        for stamp in common:
-            assert other[stamp].pose == truth[stamp].pose
-            assert other[stamp].twist == truth[stamp].twist
-            assert other_odometry[stamp].pose == odometry[stamp].pose
+    other_odometry, other = drive(50.0)
+    common = [stamp for stamp in sorted(truth.keys() & other.keys()) if stamp >= last]
+    assert len(common) >= 9
+    for stamp in common:
+        assert other[stamp].pose == truth[stamp].pose
+        assert other[stamp].twist == truth[stamp].twist
+        assert other_odometry[stamp].pose == odometry[stamp].pose
     _, of_other_seed = drive(10.0, slip_seed=8)
     assert of_other_seed[common[-1]].pose != truth[common[-1]].pose
 
@@ -209,18 +194,12 @@ def test_initialpose_places_the_robot_and_reset_odometry_its_odometry_alone(lock
 
 
 @pytest.mark.parametrize(
-    ('parameters', 'reason'),
+    ('parameters', 'named'),
     [
-        ({'slip_seed': 1.5}, "parameter 'slip_seed' must be an integer, got 1.5"),
-        ({'slip_seed': 'one'}, "parameter 'slip_seed' must be an integer, got 'one'"),
-        ({'slip_seed': True}, "parameter 'slip_seed' must be an integer, got True"),
-        ({'slip_seed': -1}, "parameter 'slip_seed' must be in [0, 9223372036854775807], got -1"),
-        ({'simulate_slip': 1}, "parameter 'simulate_slip' must be a bool (true or false), got 1"),
-        *(
-            ({name: value}, f"parameter '{name}' must be in [0.1, 10], got {value}")
-            for name in MULTIPLIERS
-            for value in (0.0, -1.0, 0.099, math.nan)
-        ),
+        *(({'slip_seed': seed}, "'slip_seed' must be") for seed in (1.5, 'one', True, -1)),
+        ({'simulate_slip': 1}, "'simulate_slip' must be a bool"),
+        *(({name: 0.099}, f"'{name}' must be in .0.1, 10., got 0.099") for name in MULTIPLIERS),
+        ({'true_wheel_separation_multiplier': math.nan}, "'true_wheel_separation_multiplier' must"),
         (
             {'simulate_slip': True, 'ground_truth_frame_id': 'odom'},
             "parameters 'ground_truth_frame_id' and 'odom_frame_id' must differ, both are 'odom'",
@@ -232,10 +211,9 @@ def test_initialpose_places_the_robot_and_reset_odometry_its_odometry_alone(lock
     ],
     ids=str,
 )
-def test_invalid_parameters_are_refused_with_the_reason(parameters, reason):
-    with pytest.raises(ParameterError) as error:
+def test_invalid_parameters_are_named(parameters, named):
+    with pytest.raises(ParameterError, match=named):
         from_ros(VirtualRobotParameters, parameters)
-    assert str(error.value) == reason
 
 
 def test_the_largest_seed_and_a_frame_map_of_a_perfect_robot_are_valid(lockstep, robot_at):
@@ -334,13 +312,6 @@ def test_the_figure_shows_truth_and_odometry(run):
     assert shown[~np.isnan(shown[:, 0])].tolist() == run.ground_truth.values[:, :2].tolist()
     labels = [text.get_text() for text in drawn.axes[-1].get_legend().get_texts()]
     assert 'ground truth and its end' in labels
-    bare = replace(run, ground_truth=replace(run.ground_truth, **empty(run.ground_truth)))
-    assert not truths_in(figure([bare]))
-
-
-def empty(series):
-    return {
-        'received': series.received[:0],
-        'stamps': series.stamps[:0],
-        'values': series.values[:0],
-    }
+    truth = run.ground_truth
+    none = replace(truth, received=truth.received[:0], stamps=truth.stamps[:0], values=truth.values[:0])
+    assert not truths_in(figure([replace(run, ground_truth=none)]))

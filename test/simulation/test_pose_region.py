@@ -38,13 +38,17 @@ def region_after(drive):
     return region_of(poses[-1], errors), errors
 
 
-@pytest.mark.parametrize('duration', [10.0, 60.0])
-@pytest.mark.parametrize('drive_for', DRIVES.values(), ids=DRIVES)
-def test_the_region_holds_95_percent_of_four_thousand_other_runs(drive_for, duration):
-    region, _ = region_after(drive_for(duration))
-    errors = noisy_runs(np.random.default_rng(5), drive_for(duration), NONE, 4000, L, K)
-    within = region_distance(region, region.pose[:2] + errors[:, :2]) <= region.level
-    assert 0.94 <= within.mean() <= 0.96
+def share_within(region, drive, covariance=NONE):
+    """Of 2,000 noisy robots; its standard error is 0.5 %."""
+    errors = noisy_runs(np.random.default_rng(5), drive, covariance, 2000, L, K)
+    return np.mean(region_distance(region, region.pose[:2] + errors[:, :2]) <= region.level)
+
+
+@pytest.mark.parametrize(('name', 'duration'), [*((name, 10.0) for name in DRIVES), ('straight', 60.0)])
+def test_the_region_holds_95_percent_of_two_thousand_other_runs(name, duration):
+    drive = DRIVES[name](duration)
+    region, _ = region_after(drive)
+    assert 0.94 <= share_within(region, drive) <= 0.96
 
 
 def test_drawn_runs_have_the_exact_second_moment():
@@ -60,10 +64,10 @@ def test_drawn_runs_have_the_exact_second_moment():
     assert np.all(np.abs(second - moments.second_moment) < 0.1 * np.outer(deviations, deviations))
 
 
-@pytest.mark.parametrize('largest', [0.0, 1e-9, 0.01, 0.5, 0.51, 7.0])
-def test_the_ratio_of_chord_and_arc_is_that_of_sinc(largest):
-    turns = np.linspace(-largest, largest, 101)
-    np.testing.assert_allclose(_chord(turns), np.sinc(turns / math.tau), rtol=0.0, atol=5e-11)
+def test_the_ratio_of_chord_and_arc_is_that_of_sinc():
+    for largest in (0.0, 1e-9, 0.5, 0.51, 7.0):
+        turns = np.linspace(-largest, largest, 101)
+        np.testing.assert_allclose(_chord(turns), np.sinc(turns / math.tau), rtol=0.0, atol=5e-11)
 
 
 def test_exponential_coordinates_are_those_of_log():
@@ -89,8 +93,8 @@ def test_a_distance_is_the_least_over_all_headings():
     covariance = np.array([[0.01, 0.0, 0.0], [0.0, 0.3, 0.2], [0.0, 0.2, 0.25]])
     region = Region(np.array([1.0, 2.0, 0.6]), covariance, ELLIPSE_LEVEL)
     inverted = np.linalg.inv(covariance)
-    for position in np.random.default_rng(3).normal([1.0, 2.0], 0.4, (20, 2)):
-        turned = np.linspace(-2.0, 2.0, 40_001)
+    for position in np.random.default_rng(3).normal([1.0, 2.0], 0.4, (8, 2)):
+        turned = np.linspace(-2.0, 2.0, 10_001)
         errors = np.column_stack([np.tile(position - region.pose[:2], (len(turned), 1)), turned])
         xi = log_about(region.pose, errors)
         least = np.einsum('ni,ij,nj->n', xi, inverted, xi).min()
@@ -153,9 +157,7 @@ def test_the_regions_along_a_path_hold_95_percent_of_the_robots():
     found = uncertainties(timeline(driven(drive)), places=3)
     assert len(found) == 3
     last = found[-1]
-    errors = noisy_runs(np.random.default_rng(6), drive, NONE, 4000, L, K)
-    within = region_distance(last.region, last.region.pose[:2] + errors[:, :2]) <= last.region.level
-    assert 0.94 <= within.mean() <= 0.96
+    assert 0.94 <= share_within(last.region, drive) <= 0.96
     assert np.all(last.extent[0] < last.region.pose[:2])
     assert np.all(last.region.pose[:2] < last.extent[1])
 
@@ -164,18 +166,12 @@ def test_the_start_of_a_run_may_be_unsure():
     covariance = np.diag([0.01, 0.01, 0.04])
     drive = [((0.22, 0.2), 10.0)]
     (only,) = uncertainties(timeline(driven(drive, covariance=covariance)), places=1)
-    errors = noisy_runs(np.random.default_rng(6), drive, covariance, 4000, L, K)
-    within = region_distance(only.region, only.region.pose[:2] + errors[:, :2]) <= only.region.level
-    assert 0.94 <= within.mean() <= 0.96
+    assert 0.94 <= share_within(only.region, drive, covariance) <= 0.96
 
 
 def legends(run):
-    drawing = figure([run])
-    return [text.get_text() for axes in drawing.axes for text in _legend_texts(axes)]
-
-
-def _legend_texts(axes):
-    return axes.get_legend().get_texts() if axes.get_legend() else []
+    legends = filter(None, (axes.get_legend() for axes in figure([run]).axes))
+    return [text.get_text() for legend in legends for text in legend.get_texts()]
 
 
 def test_the_figure_has_the_region_and_the_ellipse():
@@ -184,7 +180,7 @@ def test_the_figure_has_the_region_and_the_ellipse():
     assert ELLIPSE_LABEL in labels
 
 
-@pytest.mark.parametrize('entry', [math.nan, math.inf, -1.0, 0.0])
+@pytest.mark.parametrize('entry', [math.nan, -1.0, 0.0])
 def test_covariances_that_are_not_of_wheels_are_not_drawn(entry):
     run = driven([((0.22, 0.0), 1.0)])
     for column in range(9):

@@ -1,0 +1,312 @@
+"""The laws of goals: document A's, document B's offset point, Aicardi's of poses (1995).
+
+What their sources prove of them, pose by pose, and what becomes of many robots that they drive.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from diffdrive_jacobian.control import (
+    Arrival,
+    VelocityLimits,
+    go_to_goal,
+    go_to_pose,
+    offset_point,
+)
+from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.kinematics import diff_drive, se2
+from diffdrive_jacobian.simulation import closed_loops
+
+KP, KV = 3.0, 0.5  # document A's gains
+COUNT = 2_000
+LAWS = {'go_to_goal': go_to_goal, 'offset_point': offset_point, 'pose': go_to_pose}
+GAINS = {'go_to_goal': ['Kp', 'Kv'], 'offset_point': ['k', 'd'], 'pose': ['Kp', 'Kv', 'h']}
+HEADING_COUNTS = Arrival(use_heading=True)
+
+
+def limits_of(v, omega, wheels):
+    return VelocityLimits(min_v=-v, max_v=v, min_omega=-omega, max_omega=omega, max_wheel_speed=wheels)
+
+
+def random_poses(seed, count=COUNT, size=3.0):
+    """Starts and goals that have nothing to do with each other, shape (2, count, 3)."""
+    box = [size, size, np.pi]
+    return np.random.default_rng(seed).uniform(np.negative(box), box, (2, count, 3))
+
+
+def random_gains(seed, count=COUNT, names=2):
+    """Sluggish and wild ones."""
+    return 10.0 ** np.random.default_rng(seed).uniform(-1.5, 1.5, (names, count))
+
+
+def goals_of(name, targets):
+    """The goals as a law takes them."""
+    return targets if name == 'pose' else targets[..., :2]
+
+
+def polar(states, targets):
+    """Distance, bearing seen from the robot, the same seen from the goal's heading (all independent)."""
+    way = (targets[..., 0] - states[..., 0]) + 1j * (targets[..., 1] - states[..., 1])
+    alpha = np.angle(way * np.exp(-1j * states[..., 2]))
+    phi = np.angle(way * np.exp(-1j * targets[..., 2]))
+    return np.abs(way), alpha, phi
+
+
+def point(poses, d):
+    """The offset point, written out."""
+    x, y, theta = np.moveaxis(np.asarray(poses), -1, 0)
+    return np.stack([x + d * np.cos(theta), y + d * np.sin(theta)], -1)
+
+
+# --- What all laws have in common
+
+
+@pytest.mark.parametrize('name', LAWS)
+def test_states_goals_and_gains_broadcast(name):
+    law, (states, targets) = LAWS[name], random_poses(1, 4)
+    gains = random_gains(2, 4, len(GAINS[name]))
+    goals = goals_of(name, targets)
+    grid = law(states[:3, np.newaxis], goals, gains[0, :3, np.newaxis], *gains[1:])
+    assert [part.shape for part in grid] == [(3, 4)] * 2
+    for i, j in np.ndindex(3, 4):
+        one = law(states[i], goals[j], gains[0, i], *gains[1:, j])
+        assert_allclose([part[i, j] for part in grid], one, rtol=1e-12, atol=1e-14)
+        assert type(one[0]) is type(one[1]) is float
+    # One argument alone may have the axes.
+    for many in range(len(gains)):
+        values = [1.0] * len(gains)
+        values[many] = np.ones((2, 1))
+        assert [part.shape for part in law(np.zeros((7, 3)), goals[0], *values)] == [(2, 7)] * 2
+
+
+@pytest.mark.parametrize('name', LAWS)
+def test_moved_to_another_place_or_mirrored_a_law_is_the_same(name):
+    law, (states, targets), motions = LAWS[name], random_poses(3), random_poses(4)[0]
+
+    def twists(states, targets):
+        return np.array(law(states, goals_of(name, targets), KP, KV))
+
+    here = twists(states, targets)
+    moved = twists(se2.compose(motions, states), se2.compose(motions, targets))
+    assert_allclose(moved, here, rtol=1e-8, atol=1e-8)
+    mirror = np.array([1.0, -1.0, -1.0])
+    # Not every library's sine is exactly odd.
+    assert_allclose(twists(mirror * states, mirror * targets), [here[0], -here[1]], atol=1e-12)
+
+
+@pytest.mark.parametrize('name', BUILT_IN)
+def test_a_law_and_its_unchecked_equation_agree(name):
+    law, (states, targets) = BUILT_IN[name].law, random_poses(5, 50)
+    goals, gains = goals_of(name, targets), random_gains(6, 50)
+    np.testing.assert_array_equal(law.formula(states.T, goals.T, *gains), law(states, goals, *gains))
+
+
+BAD_GAINS = {
+    'go_to_goal': [math.nan, math.inf],
+    'offset_point': [math.nan, math.inf],
+    'pose': [math.nan, math.inf, 0.0, -1.0, [1.0, -2.0]],
+}
+
+
+@pytest.mark.parametrize('name', LAWS)
+def test_invalid_arguments_are_named(name):
+    good = {'state': np.zeros((2, 3)), 'goal': np.ones(3 if name == 'pose' else 2)}
+    good |= dict.fromkeys(GAINS[name], 0.5)
+    size = len(good['goal'])
+    bad = {
+        'state': [np.zeros(2), np.zeros(4), (0.5,), 0.0, [[0.0, 0.0, np.nan]], 'here'],
+        'goal': [np.zeros(5 - size), (0.5,), np.full(size, -np.inf), np.zeros((3, size))],
+        **{gain: [*BAD_GAINS[name], np.ones(3), 'much', 1j] for gain in GAINS[name]},
+    }
+    if name == 'offset_point':
+        # The axle centre itself can only be driven ahead.
+        bad['d'] += [0.0, -0.0, [0.1, 0.0], np.zeros((2, 2))]
+    for argument, values in bad.items():
+        for value in values:
+            with pytest.raises(ValueError, match=rf'\b{argument}\b.* must ') as caught:
+                LAWS[name](**{**good, argument: value})
+            assert 'got' in str(caught.value), (argument, value)
+    if name == 'offset_point':
+        with pytest.raises(ValueError, match=r'^d must be .*not 0.* rank 1.*got 0'):
+            offset_point(np.zeros(3), [1.0, 1.0], 1.0, 0.0)
+
+
+# --- Document A
+
+
+def document_a(state, goal, Kp, Kv):
+    """Equations (9)-(11) as document A's script computes them."""
+    (x, y, theta), (x_goal, y_goal) = state, goal
+    d = math.sqrt((x_goal - x) ** 2 + (y_goal - y) ** 2)
+    error = math.atan2(y_goal - y, x_goal - x) - theta
+    error = math.atan2(math.sin(error), math.cos(error))
+    return Kv * d * math.cos(error), Kp * error
+
+
+def test_go_to_goal_is_document_as():
+    (states, targets), gains = random_poses(7), random_gains(8)
+    # Abeam of the goal; and across the cut, where 2 degrees are left.
+    states[:4] = [(0, 0, 0), (0, 0, 0), (0, 0, math.radians(-179)), (0, 0, math.radians(179))]
+    degree = math.radians(1.0)
+    cut = 2.0 * np.array([-math.cos(degree), math.sin(degree)])
+    targets[:4, :2] = [(0, 1), (0, -1), cut, cut * [1, -1]]
+    v, omega = go_to_goal(states, targets[:, :2], *gains)
+    expected = [document_a(*one) for one in zip(states, targets[:, :2], *gains, strict=True)]
+    assert_allclose(np.column_stack([v, omega]), expected, rtol=1e-12, atol=1e-12)
+    assert_allclose(v[:2], 0.0, atol=1e-14)
+    assert_allclose(omega[:4] / gains[0, :4], [math.pi / 2, -math.pi / 2, -2 * degree, 2 * degree])
+    # The distance never grows: d_dot = -Kv d cos^2(e).
+    distance, error, _ = polar(states, targets)
+    q_dot = (diff_drive.unicycle_jacobian(states[:, 2]) @ np.stack([v, omega], -1)[..., None])[..., 0]
+    d_dot = -np.sum((targets - states)[:, :2] * q_dot[:, :2], axis=-1) / distance
+    assert_allclose(d_dot, -gains[1] * distance * np.cos(error) ** 2, rtol=1e-9, atol=1e-12)
+
+
+def test_go_to_goal_arrives_from_every_start():
+    states, targets = random_poses(9, 500)
+    assert closed_loops(go_to_goal, states, targets[:, :2], KP, KV, duration=20.0).arrived.all()
+
+
+# --- Document B: the offset point goes straight to its goal, like exp(-k t)
+
+
+def random_offsets(seed, count=COUNT):
+    """Points in front of the axle and behind it."""
+    rng = np.random.default_rng(seed)
+    return rng.choice([-1.0, 1.0], count) * 10.0 ** rng.uniform(-2.0, 0.5, count)
+
+
+def test_the_offset_point_moves_straight_towards_its_goal_whatever_the_heading():
+    (states, targets), (k, _), d = random_poses(12), random_gains(13), random_offsets(14)
+    goals = targets[:, :2]
+    v, omega = offset_point(states, goals, k, d)
+    wanted = k[:, np.newaxis] * (goals - point(states, d))
+    c, s = np.cos(states[:, 2]), np.sin(states[:, 2])
+    moves = np.stack([v * c - d * omega * s, v * s + d * omega * c], -1)
+    assert_allclose(moves, wanted, rtol=1e-10, atol=1e-10)
+    # With document B's Jacobian, whatever the wheels.
+    r, L = np.random.default_rng(15).uniform([[0.01], [0.1]], [[0.1], [0.6]], (2, COUNT))
+    wheels = np.stack(diff_drive.body_to_wheel(v, omega, r, L), -1)
+    J_d = diff_drive.offset_point_jacobian(states[:, 2], r, L, d)
+    assert_allclose((J_d @ wheels[..., np.newaxis])[..., 0], wanted, rtol=1e-8, atol=1e-8)
+    # On the goal it rests.
+    v, omega = offset_point(states, point(states, d), k, d)
+    assert max(np.abs(v / k).max(), np.abs(omega * d / k).max()) < 1e-14
+
+
+def test_the_offset_point_arrives_when_it_should_with_the_axle_beside_the_goal():
+    (states, targets), d = random_poses(17, 500), random_offsets(18, 500)
+    d += np.copysign(0.2, d)
+    states[:100, 2], goals = np.pi, targets[:, :2]
+    goals[:50] = states[:50, :2] + [3.0, 0.0]  # exactly behind
+    found = closed_loops(offset_point, states, goals, 1.0, d, duration=15.0, arrival=Arrival(offset=d))
+    assert found.arrived.all()
+    assert np.hypot(*(point(found.pose, d) - goals).T).max() <= 0.02
+    axle = np.hypot(*(found.pose[:, :2] - goals).T)
+    assert np.abs(axle - np.abs(d)).max() <= 0.02
+    distance = np.hypot(*(point(states, d) - goals).T)
+    assert np.abs(found.time - np.log(np.maximum(distance / 0.02, 1.0))).max() < 0.3
+
+
+# --- Aicardi et al.: position and heading
+
+
+def test_go_to_pose_is_aicardis_law_with_document_as_speed():
+    (states, targets), (Kp, Kv, h) = random_poses(19), random_gains(20, names=3)
+    rho, alpha, phi = polar(states, targets)
+    bend = Kv * np.cos(alpha) * np.sin(alpha) / alpha
+    v, omega = go_to_pose(states, targets, Kp, Kv, h)
+    assert_allclose(v, Kv * rho * np.cos(alpha), rtol=1e-11, atol=1e-12)
+    assert_allclose(omega, Kp * alpha + bend * (alpha + h * phi), rtol=1e-10, atol=1e-10)
+    assert np.array_equal(v, go_to_goal(states, targets[:, :2], Kp, Kv)[0])
+    # Towards alpha = 0 there is no hole.
+    for alpha in (0.0, 1e-300, -1e-300, 1e-12, -1e-9, 1e-6):
+        v, omega = go_to_pose([-1.0, 0.0, -alpha], [0.0, 0.0, 0.4], KP, KV, 2.0)
+        assert v == pytest.approx(KV)
+        assert omega == pytest.approx(KP * alpha + KV * (alpha + 2.0 * -0.4), abs=1e-11)
+    # A goal exactly behind is backed up to while turning.
+    for y in (0.0, -0.0):
+        v, omega = go_to_pose([2.0, y, 0.0], [0.0, 0.0, 0.3], KP, KV)
+        assert (v, abs(omega)) == (-2.0 * KV, pytest.approx(KP * math.pi))
+
+
+def test_without_a_weight_the_heading_converges_at_critical_damping_or_twice_as_fast_as_the_distance():
+    (states, targets), (Kp, Kv) = random_poses(21), random_gains(22)
+    ratio = Kp / Kv
+    assert 0.1 < np.mean(ratio > 4.0) < 0.9
+    weight = np.where(ratio <= 4.0, (ratio / 2.0) ** 2, 2.0 * ratio - 4.0)
+    given = go_to_pose(states, targets, Kp, Kv, weight)
+    assert_allclose(go_to_pose(states, targets, Kp, Kv), given, rtol=1e-9, atol=1e-9)
+    # Near the goal heading and bearing settle like s^2 + Kp s + Kv^2 h: see where its roots lie.
+    for kp, kv, h in zip(Kp[:100], Kv[:100], weight[:100], strict=True):
+        slowest = np.roots([1.0, kp, kv * kv * h]).real.max()
+        expected = -kp / 2.0 if kp <= 4.0 * kv else -2.0 * kv
+        assert slowest == pytest.approx(expected, rel=1e-6)
+
+
+def test_on_the_position_it_stands_still_whatever_the_headings():
+    states, targets = random_poses(23, 1000)
+    targets[:, :2] = states[:, :2]
+    assert not np.any(go_to_pose(states, targets, KP, KV))
+    assert not np.any(go_to_goal(states, targets[:, :2], KP, KV))
+    for theta in (0.0, -0.0, math.pi, -math.pi, 2.0):
+        for x in (0.0, -0.0):
+            assert go_to_pose([x, x, theta], [0.0, -0.0, 1.0], KP, KV) == (0.0, 0.0)
+
+
+def test_the_lyapunov_function_never_grows_along_the_polar_equations():
+    (states, targets), (Kp, Kv, h) = random_poses(24), random_gains(25, names=3)
+    rho, alpha, phi = polar(states, targets)
+    v, omega = go_to_pose(states, targets, Kp, Kv, h)
+    rho_dot = -v * np.cos(alpha)
+    phi_dot = v * np.sin(alpha) / rho
+    alpha_dot = phi_dot - omega
+    terms = 2.0 * np.array([rho * rho_dot, alpha * alpha_dot, h * phi * phi_dot])
+    rounding = 1e-12 * np.abs(terms).max(axis=0)
+    V_dot = terms.sum(axis=0)
+    assert np.all(V_dot <= rounding)
+    exact = -2.0 * (Kv * (rho * np.cos(alpha)) ** 2 + Kp * alpha**2)
+    assert np.all(np.abs(V_dot - exact) <= rounding)
+    # The polar equations are the robot's motion.
+    dt = 1e-7
+    moved = se2.integrate(states, np.stack([v, omega], -1), dt)
+    rates = (np.array(polar(moved, targets)) - [rho, alpha, phi]) / dt
+    smooth = (np.pi - np.abs([alpha, phi])).min(axis=0) > 0.01
+    allowed = 1e-4 * (1.0 + (np.abs(v) / rho + np.abs(omega)) ** 2) * (1.0 + rho)
+    for rate, expected in zip(rates, (rho_dot, alpha_dot, phi_dot), strict=True):
+        assert np.all(np.abs(rate - expected)[smooth] <= allowed[smooth])
+    assert np.mean(smooth) > 0.98
+
+
+# --- Robots that go_to_pose drives
+
+
+@pytest.mark.parametrize('case', ['free', 'limited', 'forwards', 'near'])
+def test_poses_are_taken_from_everywhere(case):
+    states, targets = random_poses(28, 400, {'near': 0.05, 'limited': 1.5}.get(case, 3.0))
+    gains, limits = (KP, KV), VelocityLimits()
+    if case == 'limited':
+        # Under limits the paths are shorter: several of them take long all the same.
+        limits = limits_of(0.22, 2.84, 6.67)
+        states, targets = states[:100], targets[:100]
+    if case == 'forwards':
+        # A robot that may not back up, whatever the gains.
+        states, targets = states[:200], targets[:200]
+        gains, limits = (np.repeat([6.0, 12.0, 24.0, 45.0], 50), 0.5), VelocityLimits(min_v=0.0)
+    if case == 'near':
+        # With headings beside pi, exactly behind, and with other gains.
+        states[::2, 2], targets[::3, 2] = np.pi, -np.pi
+        states[::5, :2], targets[::7, :2] = [0.3, 0.0], 0.0
+        Kv, ratio = np.random.default_rng(29).uniform([[0.3], [1.0]], [[2.0], [10.0]], (2, 400))
+        gains = Kv * ratio, Kv
+    how = {'arrival': HEADING_COUNTS, 'limits': limits, 'duration': 90.0}
+    found = closed_loops(go_to_pose, states, targets, *gains, **how)
+    off = np.hypot(*(found.pose - targets).T[:2])
+    turned = np.abs(se2.wrap_angle((found.pose - targets)[:, 2]))
+    failed = np.flatnonzero(~found.arrived | (off > 0.02) | (turned > 0.02))
+    assert not failed.size, [(states[i].tolist(), targets[i].tolist()) for i in failed]

@@ -1,0 +1,184 @@
+"""The public functions of kinematics, control and simulation, each with valid arguments."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from diffdrive_jacobian import control, simulation
+from diffdrive_jacobian.control import Arrival, StraightLine, VelocityLimits, Waypoints
+from diffdrive_jacobian.kinematics import contact, diff_drive, rigid_body, se2, spatial
+from diffdrive_jacobian.kinematics import inverse_kinematics as ik
+from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+from diffdrive_jacobian.simulation import Drift, Robot, RobotModel, odometry_noise
+from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
+
+POSE, TWIST, GOAL, TURNED = (0.3, -0.2, 1.0), (0.2, 0.5), (1.0, 2.0), (1.0, -0.2, 0.3)
+WHEELS, THETA = {'r': 0.033, 'L': 0.16}, {'theta': 0.5}
+LIMITS = VelocityLimits(min_v=-0.1, max_v=0.22, min_omega=-2.0, max_omega=2.0, max_wheel_speed=10.0)
+COVARIANCE = np.diag([1e-4, 1e-4, 1e-3])
+ODOMETRY = {'L': 0.16, 'wheel_travel_variance': 1e-5}
+MODEL = RobotModel(limits=LIMITS, command_timeout=10**9)
+ROBOT = Robot(model=MODEL, stamp=0, pose=np.array(POSE)).commanded(TWIST, 0)
+DRIFTING = Robot(model=dataclasses.replace(MODEL, drift=Drift(seed=3)), stamp=0, pose=np.array(POSE))
+LINE = StraightLine([0.0, 0.0], [1.0, 0.0], 0.1)
+WAYPOINTS = Waypoints([[1.0, 0.0, 0.0], [1.0, 1.0, 2.0]])
+ARM = PlanarArm([1.0, 0.7])
+MANIPULATOR = MobileManipulator(0.033, 0.16, ARM)
+Q, X_DOT, WHOLE_Q = (0.5, 0.9), (0.1, -0.2), (0.1, 0.2, 0.3, 0.5, 0.9)
+SQUARE, WIDE = ARM.jacobian(Q), PlanarArm([0.5, 0.4, 0.3]).jacobian([0.1, 0.2, 0.3])
+WEIGHTS, RANGE = (1.0, 2.0, 0.5), {'lower': (-3.0, -2.0), 'upper': (2.0, 2.5)}
+HERE, THERE = np.eye(4), np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+LOOP = {
+    **{'law': control.go_to_goal, 'starts': POSE, 'goals': GOAL, 'rate': 10.0, 'duration': 0.3},
+    **{'turning_gain': 3.0, **WHEELS, 'arrival': Arrival(), 'limits': LIMITS},
+}
+
+
+def law(pose, goal):
+    return 0.1, 0.2
+
+
+def closed_loops(starts, goals, law, **options):
+    return simulation.closed_loops(law, starts, goals, 3.0, 0.5, **options)
+
+
+def trajectories(starts, goals, law, **options):
+    return simulation.trajectories(law, starts, goals, 3.0, 0.5, **options)
+
+
+BROADCASTING = {
+    diff_drive.unicycle_jacobian: THETA,
+    diff_drive.wheel_to_body_jacobian: WHEELS,
+    diff_drive.body_to_wheel_jacobian: WHEELS,
+    diff_drive.wheel_to_world_jacobian: THETA | WHEELS,
+    diff_drive.single_wheel_jacobian: {'theta': 0.5, 'r': 0.033},
+    diff_drive.wheel_to_position_jacobian: THETA | WHEELS,
+    diff_drive.offset_point: {'pose': POSE, 'd': 0.1},
+    diff_drive.offset_point_jacobian: {**THETA, **WHEELS, 'd': -0.1},
+    diff_drive.body_to_wheel: {'v': 0.2, 'omega': 0.5, **WHEELS},
+    diff_drive.wheel_to_body: {'omega_R': 2.0, 'omega_L': 3.0, **WHEELS},
+    diff_drive.wheel_centres: {'pose': POSE, 'L': 0.16},
+    diff_drive.wheel_centre_velocities: {**THETA, 'q_dot': POSE, 'L': 0.16},
+    diff_drive.no_lateral_slip_constraint: THETA,
+    diff_drive.lie_bracket: THETA,
+    diff_drive.controllability_matrix: THETA,
+    diff_drive.rolling_constraints: THETA | WHEELS,
+    contact.wheel_contact_position: {'x': 0.1, 'phi': 0.5, 'r': 0.033},
+    contact.wheel_contact_jacobian: {'phi': 0.5, 'r': 0.033},
+    contact.rolling_direction: {'r': 0.033},
+    rigid_body.point_velocity: {'v': POSE, 'omega': POSE, 'offset': (0.0, 0.1, 0.2)},
+    spatial.spatial_displacement: {'T': HERE, 'T_desired': THERE},
+    se2.wrap_angle: {'angle': 4.0},
+    se2.sinc: {'angle': 0.5},
+    se2.exp: {'twist': POSE},
+    se2.log: {'pose': POSE},
+    se2.compose: {'first': POSE, 'second': TURNED},
+    se2.inverse: {'pose': POSE},
+    se2.homogeneous: {'pose': POSE},
+    se2.homogeneous_3d: {'pose': POSE},
+    se2.adjoint: {'pose': POSE},
+    se2.left_jacobian: {'twist': POSE},
+    se2.right_jacobian: {'twist': POSE},
+    se2.integrate: {'pose': POSE, 'twist': TWIST, 'dt': 0.5},
+    iv.adjugate_inverse: {'J': SQUARE},
+    iv.pseudoinverse: {'J': WIDE, 'weights': WEIGHTS},
+    iv.damping: {'manipulability': 0.1, 'threshold': 0.2, 'maximum': 0.1},
+    iv.damped_least_squares: {'J': WIDE, 'x_dot': X_DOT, 'damping': 0.1, 'weights': WEIGHTS},
+    iv.null_space_projector: {'J': WIDE, 'damping': 0.1, 'weights': WEIGHTS},
+    iv.redundant: {'J': WIDE, 'x_dot': X_DOT, 'q_dot_0': POSE, 'damping': 0.1, 'weights': WEIGHTS},
+    iv.manipulability: {'J': WIDE},
+    iv.velocity_ellipsoid: {'J': WIDE},
+    iv.force_ellipsoid: {'J': WIDE},
+    iv.smallest_singular_value: {'J': WIDE},
+    iv.condition_number: {'J': WIDE},
+    iv.masked_task: {'J': WIDE, 'x_dot': X_DOT, 'mask': (1.0, 0.5)},
+    iv.manipulability_gradient: {'jacobian': ARM.jacobian, 'q': Q},
+    iv.joint_limit_cost: {'q': Q, **RANGE},
+    iv.joint_limit_gradient: {'q': Q, **RANGE},
+    iv.limit_velocity: {'q_dot': POSE, 'max_velocity': (0.1, 0.4, 0.2)},
+    iv.prioritized: {
+        **{'tasks': [(WIDE, X_DOT), ([[1.0, 0.0, 2.0]], [0.5])], 'damping': 0.1},
+        **{'weights': WEIGHTS, 'max_velocity': (1.0, 4.0, 2.0)},
+    },
+    ik.pose_difference: {'target': (1.0, 2.0, 3.0), 'pose': (0.5, 0.5, -3.0)},
+    ARM.joint_positions: {'q': Q},
+    ARM.forward_kinematics: {'q': Q},
+    ARM.jacobian: {'q': Q},
+    ARM.determinant: {'q': Q},
+    ARM.singular_configurations: {'q_1': 0.5},
+    ARM.inverse_kinematics: {'position': (1.0, 0.5)},
+    ARM.inverse_velocity: {'q': Q, 'x_dot': X_DOT},
+    ARM.clearance: {'q': Q, 'obstacle': GOAL},
+    ARM.clearance_gradient: {'q': Q, 'obstacle': GOAL},
+    ARM.joint_torques: {'q': Q, 'wrench': (0.1, -0.2, 0.3)},
+    ARM.integrate: {'q': Q, 'q_dot': X_DOT, 'dt': 0.1},
+    MANIPULATOR.forward_kinematics: {'q': WHOLE_Q},
+    MANIPULATOR.jacobian: {'q': WHOLE_Q},
+    MANIPULATOR.configuration_jacobian: {'q': WHOLE_Q},
+    MANIPULATOR.integrate: {'q': WHOLE_Q, 'q_dot': (3.0, 2.0, 0.1, 0.2), 'dt': 0.1},
+    control.go_to_goal: {'state': POSE, 'goal': GOAL, 'Kp': 3.0, 'Kv': 0.5},
+    control.turn_in_place: {'theta': 0.5, 'heading': 3.0, 'Kp': 3.0},
+    control.offset_point: {'state': POSE, 'goal': GOAL, 'k': 0.5, 'd': 0.1},
+    control.go_to_pose: {'state': POSE, 'goal': TURNED, 'Kp': 3.0, 'Kv': 0.5, 'h': 2.0},
+    control.saturate: {'v': 3.0, 'omega': 5.0, 'limits': LIMITS, **WHEELS},
+    control.resolved_rate: {
+        **{'J': WIDE, 'x': Q, 'x_desired': GOAL, 'x_dot_desired': X_DOT, 'gain': 1.0, 'damping': 0.1},
+        **{'q_dot_0': POSE, 'max_correction': 0.3, 'weights': WEIGHTS, 'max_velocity': (0.1, 0.4, 0.2)},
+    },
+    Arrival(offset=0.1).distance: {'x': 0.1, 'y': 0.2, **THETA, 'x_goal': 1.0, 'y_goal': 2.0},
+    Arrival().faces: {'theta': 0.5, 'heading': 0.51},
+    odometry_noise.twist_covariance: {'twist': TWIST, **ODOMETRY, 'interval': 0.02},
+    odometry_noise.propagate_covariance: {
+        **{'covariance': COVARIANCE, 'pose': POSE, 'twist': TWIST, 'dt': 0.5},
+        **ODOMETRY,
+    },
+}
+"""Functions whose arguments have leading axes that broadcast."""
+FIXED = {'limits', 'jacobian', 'tasks'}
+"""Arguments of these that are no arrays."""
+OTHERS = {
+    VelocityLimits: {'min_v': -1.0, 'max_v': 1.0, 'min_omega': -1.0, 'max_omega': 1.0}
+    | {'max_wheel_speed': 9.0},
+    Arrival: {
+        **{'xy_tolerance': 0.02, 'yaw_tolerance': 0.02, 'use_heading': True, 'offset': 0.1},
+        **dict.fromkeys(('trans_stopped_velocity', 'rot_stopped_velocity'), 0.1),
+    },
+    PlanarArm: {'lengths': (1.0, 0.7)},
+    MobileManipulator: {**WHEELS, 'arm': ARM, 'mount': (0.1, 0.0)},
+    Waypoints: {'poses': [POSE], 'index': 0, 'turning': False},
+    WAYPOINTS.follow: {'pose': POSE, 'law': law, 'arrival': Arrival(), 'turning_gain': 3.0},
+    StraightLine: {'start': [0.0, 0.0], 'end': [1.0, 0.0], 'speed': 0.1},
+    LINE.position: {'t': 0.5},
+    Drift: {'seed': 3, 'right_wheel_radius_multiplier': 1.01, 'left_wheel_radius_multiplier': 0.99}
+    | {'wheel_separation_multiplier': 1.02},
+    RobotModel: {
+        **{'wheel_radius': 0.033, 'wheel_separation': 0.16, 'limits': LIMITS},
+        **{'command_timeout': 10**9, 'wheel_travel_variance': 1e-5, 'drift': Drift(seed=3)},
+    },
+    MODEL.limited: {'command': TWIST},
+    Robot: {
+        **{'model': MODEL, 'stamp': 0, 'pose': POSE, 'covariance': COVARIANCE},
+        **{'wheel_angles': TWIST, 'command': TWIST, 'twist': TWIST, 'commanded_at': 0},
+    },
+    ROBOT.at: {'stamp': 5},
+    ROBOT.commanded: {'command': TWIST, 'stamp': 5},
+    ROBOT.placed: {'pose': POSE, 'covariance': COVARIANCE, 'stamp': 5},
+    ROBOT.reported: {'pose': POSE, 'wheel_angles': TWIST, 'twist': TWIST},
+    DRIFTING.pushed: {'displacement': POSE, 'stamp': 5},
+    ROBOT.remodelled: {'model': MODEL, 'stamp': 5},
+    ROBOT.restarted: {'stamp': 5},
+    ROBOT.twist_covariance: {'interval': 0.02},
+    ROBOT.twist_covariance_tuple: {'interval': 0.02},
+    propagate_moments: {
+        **{'moments': tuple(gaussian(COVARIANCE)), 'pose': POSE, 'twist': TWIST, 'dt': 0.5},
+        **ODOMETRY,
+    },
+    closed_loops: LOOP | {'progress': None},
+    trajectories: LOOP,
+}
+"""Constructors, methods of one robot, and drives."""
+CALLS = BROADCASTING | OTHERS

@@ -1,0 +1,244 @@
+"""The contract of the public functions of kinematics, control and simulation for their arguments.
+
+A bad argument is a ValueError that names it, for one robot and for a batch. Other arguments give finite
+results, and a batch gives what its robots give alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import itertools
+import re
+
+import numpy as np
+import pytest
+from public_calls import BROADCASTING, CALLS, FIXED, LIMITS, OTHERS, POSE, WHEELS
+
+from diffdrive_jacobian import control, simulation
+from diffdrive_jacobian.control import Arrival, VelocityLimits
+from diffdrive_jacobian.kinematics import (
+    contact,
+    diff_drive,
+    inverse_kinematics,
+    rigid_body,
+    se2,
+    spatial,
+)
+from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.simulation.closed_loop import Outcomes
+
+ELSEWHERE = {
+    *('solve', 'track_line', 'remaining', 'resumed', 'all', 'names', 'twist', 'wheel_speeds'),
+    *('reached', 'stopped', 'Path', 'PathController', 'PathError', 'Reference', 'follow_path'),
+    *('circle_path', 'figure_eight_path', 'line_path', 'planned_path'),
+    *('Boundary', 'Controller', 'ControllerError', 'Controllers', 'Gain', 'LawError'),
+    *('controller_names', 'find_controller', 'KP', 'KV', 'OFFSET', 'CUTOFF', 'FILTER', 'Ellipsoid'),
+    *('Sweep', 'SweepSetup', 'describe_sweep', 'sweep', 'sweep_table'),
+}
+"""Public names that are no functions of numbers, or tested in files of their own."""
+OPTIONAL = {'h', 'arrival', 'progress', 'commanded_at', 'seed', 'drift', 'threshold', 'q_dot_0'}
+"""Arguments that may be None, besides those of the checks of `iv`."""
+OPTIONAL |= {'weights', 'max_velocity', 'max_correction'}
+NOT_NUMBERS = (
+    *(None, 'text', '', '1.0', b'1', 1j, object(), {}, [1.0, [2.0, 3.0]], 10**400, 10**5000),
+    *(float, [['a', 'b']]),
+)
+EXTREME = (1e308, -1e200, 1e155, 1e154, 1e-160, 5e-324, -5e-324, 0.0, -1.0, 10**30)
+WRONG_SHAPES = ([], [1.0], [1.0] * 5, np.zeros((2, 2)), np.zeros((0, 3)), np.zeros((7, 4, 4)), ((),))
+UNLIMITED = {'max_velocity', 'max_correction', 'trans_stopped_velocity', 'rot_stopped_velocity'}
+"""Limits that may be infinite: none."""
+INFINITE = {iv.force_ellipsoid, iv.condition_number}
+"""Functions that return infinity for a singular matrix."""
+DIGITS = 16
+"""Units in the last place of the largest entry: functions of NumPy may differ from those of `math`."""
+
+
+def name_of(call):
+    return getattr(call, '__qualname__', call)
+
+
+def every(calls):
+    return pytest.mark.parametrize('call', calls, ids=name_of)
+
+
+def parts(result):
+    return result if isinstance(result, tuple) else (result,)
+
+
+def outcome(call, arguments):
+    """Return the parts of the result, or the text of the error up to the value."""
+    try:
+        return parts(call(**arguments)), ''
+    except ValueError as error:
+        return (), str(error).partition(' got ')[0]
+
+
+def with_bad_argument(call, values):
+    """Yield each argument that is a number or array, with each of these values first and last in it."""
+    for name, valid in CALLS[call].items():
+        if isinstance(valid, (int, float)):
+            yield from ((name, value, value) for value in values)
+        elif isinstance(valid, (tuple, list, np.ndarray)) and name != 'tasks':
+            for value, place in itertools.product(values, (0, -1)):
+                entries = np.array(valid, dtype=object)
+                entries[(place,) * entries.ndim] = value
+                yield name, value, entries.tolist()
+
+
+def batch_of(arguments, copies):
+    """Return arguments with a leading axis, with so many copies of each."""
+    return {name: arg if name in FIXED else [arg] * copies for name, arg in arguments.items()}
+
+
+def names(error, *allowed):
+    return re.search(rf'\b({"|".join(allowed)})\b', error)
+
+
+def assert_named(call, name, bad):
+    """Require an error that names the argument, also for a batch."""
+    _, error = outcome(call, CALLS[call] | {name: bad})
+    assert names(error, name, name.removesuffix('s')), (name, error)
+    if call in BROADCASTING and name not in FIXED:
+        assert outcome(call, batch_of(CALLS[call], 1) | {name: [bad]})[1] == error, (name, bad)
+
+
+def numbers(result):
+    """Yield every number of a result; NaN is allowed as the time of a robot that has not arrived."""
+    if isinstance(result, Outcomes):
+        assert np.all(np.isnan(result.time) == ~result.arrived)
+        result = result._replace(time=np.nan_to_num(result.time))
+    if isinstance(result, (VelocityLimits, Arrival)):
+        return  # infinite limits mean none
+    if dataclasses.is_dataclass(result):
+        result = [getattr(result, field.name) for field in dataclasses.fields(result)]
+    if isinstance(result, (tuple, list)):
+        for entry in result:
+            yield from numbers(entry)
+    elif isinstance(result, (bool, int, float, np.ndarray, np.generic)):
+        yield from np.ravel(result).tolist()
+
+
+def assert_named_or_finite(call, name, bad):
+    result, error = outcome(call, CALLS[call] | {name: bad})
+    if error:
+        # That shapes differ is the fault of either. Some functions have a matrix J as an argument.
+        assert names(error, *CALLS[call], 'J', 'q'), (name, bad, error)
+    elif call not in INFINITE:
+        assert all(map(np.isfinite, numbers(result))), (name, bad)
+
+
+def test_every_public_function_is_called_here():
+    called = {name_of(call).split('.')[-1] for call in CALLS} | ELSEWHERE
+    public = {*control.__all__, *simulation.__all__, *iv.__all__}
+    for module in (contact, diff_drive, inverse_kinematics, rigid_body, se2, spatial):
+        public |= {
+            name
+            for name, value in inspect.getmembers(module, inspect.isfunction)
+            if value.__module__ == module.__name__
+        }
+    for call in OTHERS:
+        cls = call if inspect.isclass(call) else type(getattr(call, '__self__', None))
+        # Those of other classes are properties, and functions without checks for every message.
+        public |= {name for name, _ in inspect.getmembers(cls, inspect.isfunction)}
+    assert {name for name in public if not name.startswith('_')} <= called
+
+
+@every(CALLS)
+def test_what_is_no_finite_number_is_named(call):
+    for name in {*CALLS[call]} - {'jacobian'}:
+        for value in NOT_NUMBERS:
+            optional = name in OPTIONAL or (call is control.saturate and name in WHEELS)
+            function = callable(value) and name in ('law', 'progress')
+            if not function and not (value is None and optional):
+                assert_named(call, name, value)
+    for name, value, bad in with_bad_argument(call, (np.nan, np.inf, -np.inf)):
+        if np.isinf(value) and (call is VelocityLimits or name in UNLIMITED):
+            assert_named_or_finite(call, name, bad)
+        else:
+            assert_named(call, name, bad)
+
+
+@every(CALLS)
+def test_other_shapes_are_named_or_broadcast(call):
+    for name in {*CALLS[call]} - {'jacobian'}:
+        for wrong in WRONG_SHAPES:
+            assert_named_or_finite(call, name, wrong)
+            result, error = outcome(call, CALLS[call] | {name: wrong})
+            if not error and call in BROADCASTING and name not in FIXED:
+                valid = np.ndim(CALLS[call][name])
+                lead = np.shape(wrong)[: np.ndim(wrong) - valid]
+                assert all(np.shape(part)[: len(lead)] == lead for part in result), (name, wrong)
+
+
+@every(CALLS)
+def test_extreme_numbers_are_named_or_give_finite_results_alone_and_in_a_batch(call):
+    for name, _, bad in with_bad_argument(call, EXTREME):
+        assert_named_or_finite(call, name, bad)
+        if call not in BROADCASTING or name in FIXED:
+            continue
+        arguments = CALLS[call] | {name: bad}
+        alone, error = outcome(call, arguments)
+        for batch in (batch_of(arguments, 2), arguments | {name: [bad, bad]}):
+            together, error_of_batch = outcome(call, batch)
+            assert bool(error) == bool(error_of_batch), (name, bad, error, error_of_batch)
+            for one, many in zip(alone, together, strict=True):
+                finite = np.abs(np.nan_to_num(np.asarray(one, dtype=np.float64), posinf=0.0))
+                for row in np.broadcast_to(many, (2, *np.shape(one))):
+                    np.testing.assert_allclose(row, one, rtol=0.0, atol=1e-12 * finite.max() + 1e-300)
+
+
+@every(BROADCASTING)
+def test_a_batch_gives_what_its_robots_give_alone(call):
+    arrays = {name: np.array(value) for name, value in BROADCASTING[call].items() if name not in FIXED}
+    fixed = {name: value for name, value in BROADCASTING[call].items() if name in FIXED}
+    rng = np.random.default_rng(13)
+    for name in arrays:
+        lead = {key: (5, 4) if len(arrays) == 1 else (5, 1) if key == name else (4,) for key in arrays}
+        if call is spatial.spatial_displacement:  # its matrices are rigid motions
+            batch = {key: np.broadcast_to(T, (*lead[key], 4, 4)) for key, T in arrays.items()}
+        else:
+            batch = {
+                key: value * (1.0 + 0.01 * rng.random((*lead[key], *[1] * value.ndim)))
+                for key, value in arrays.items()
+            }
+        together = parts(call(**batch, **fixed))
+        for index in np.ndindex(5, 4):
+            rows = {
+                key: np.broadcast_to(value, (5, 4, *arrays[key].shape))[index]
+                for key, value in batch.items()
+            }
+            for one, many in zip(parts(call(**rows, **fixed)), together, strict=True):
+                assert np.shape(many) == (5, 4, *np.shape(one))
+                most = DIGITS * np.spacing(np.abs(np.asarray(one, dtype=np.float64)).max())
+                np.testing.assert_allclose(many[index], one, rtol=0.0, atol=most)
+        if len(arrays) > 1:
+            apart = {key: np.stack([array] * (2 if key == name else 3)) for key, array in arrays.items()}
+            error = outcome(call, apart | fixed)[1]
+            assert names(error, name), error
+
+
+@every(BROADCASTING)
+def test_lists_tuples_and_other_numbers_give_the_same_bits(call):
+    valid = BROADCASTING[call]
+    expected = parts(call(**valid))
+    several = [
+        (expected, {name: value if name in FIXED else convert(value) for name, value in valid.items()})
+        for convert in (np.array, lambda value: np.asarray(value).tolist(), lambda v: np.float64(v)[()])
+    ]
+    if not FIXED & {*valid} and not any(map(np.ndim, valid.values())):
+        ones = parts(call(**dict.fromkeys(valid, 1.0)))
+        several += [(ones, dict.fromkeys(valid, one)) for one in (1, True, np.int8(1), np.float32(1.0))]
+    for same, arguments in several:
+        for one, other in zip(same, parts(call(**arguments)), strict=True):
+            assert type(one) is type(other)
+            assert np.array_equal(one, other)
+
+
+def test_the_law_of_one_step_of_the_node_returns_floats_and_needs_the_wheels_for_their_limit():
+    """Not NumPy's: messages and saturation take floats."""
+    for pose in (POSE, np.array(POSE), list(POSE)):
+        twist = control.saturate(*control.go_to_goal(pose, (1.0, 2.0), 3.0, 0.5), LIMITS, **WHEELS)
+        assert [type(entry) for entry in twist] == [float, float]
+    with pytest.raises(ValueError, match='so r and L must be given'):
+        control.saturate(3.0, 5.0, LIMITS)

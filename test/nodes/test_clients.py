@@ -1,0 +1,426 @@
+"""The clients of go_to_goal: goals and their status, nodes that were killed, robots that stand still."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import struct
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Goals, Odometry
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.parameter import Parameter
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import JointState
+from support.ros_messages import goal, goals, odometry, receive, value_of
+
+from diffdrive_jacobian.messages.codecs import (
+    GOAL_STATUS,
+    GOALS,
+    JOINT_STATE,
+    MOTION,
+    PARAMETER_EVENT,
+)
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
+from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.nodes import standstill
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.goal_client import (
+    DRIVEN_POINT_PARAMETERS,
+    SILENCE,
+    GoalClient,
+    driven_offset,
+    duplicates,
+    loss,
+)
+from diffdrive_jacobian.nodes.remote_goal import GoalResult, Result, _Session, _Silent
+from diffdrive_jacobian.nodes.standstill import Standstill
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.ros import liveness, serialization
+from diffdrive_jacobian.ros.liveness import LONGEST_STEP, PERIOD, Liveness
+from diffdrive_jacobian.ros.runner import discovery_off, ros_context, running
+from diffdrive_jacobian.ros.serialization import ignoring_invalid
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools import _sending
+
+
+def add_client(ros, goals, **kwargs):
+    def create(context, parameter_overrides):
+        return GoalClient('client', np.array(goals), context, **kwargs)
+
+    return ros.add(create, parameters=None)
+
+
+# --- Goals
+
+
+def test_goals_are_sent_with_the_first_odometry_unless_withdrawn(ros):
+    client = add_client(ros, [[1.0, 0.0, 0.0], [1.0, 1.0, 0.5]])
+    received, talk = ros.listen(Goals, 'goals'), ros.talk(Odometry, 'odom')
+    assert client.distance == math.inf
+    client.send_on_odometry()
+    client.withdraw()
+    talk.publish(odometry(0.5, 0.0, 0.0))
+    ros.until(lambda: client.robot is not None, 'odometry is received')
+    assert client._follower.newest is None
+    assert client.distance == 0.5
+    client.index = 1
+    assert client.distance == pytest.approx(math.hypot(0.5, 1.0))
+    client.send_on_odometry()
+    talk.publish(odometry(0.5, 0.0, 0.0))
+    ros.until(lambda: received, 'the goals are received')
+    assert [pose.pose.position.y for pose in received[0].goals] == [0.0, 1.0]
+
+
+def test_a_single_goal_has_the_frame_and_a_status(ros):
+    client = add_client(ros, [[1.0, 2.0, 0.0]], topic='goal_pose', frame='odom')
+    received = ros.listen(PoseStamped, 'goal_pose')
+    ros.add(GoToGoal)
+    ros.until(lambda: client.obstacle() is None, 'the controller is discovered')
+    client.send()
+    ros.until(lambda: client.status == GoalStatus.STATUS_ACCEPTED, 'the goal is accepted')
+    assert received[0].header.frame_id == 'odom'
+    assert not client.ended
+    client.cancel()
+    ros.until(lambda: client.ended, 'the goal is canceled')
+
+
+def test_invalid_goals_and_topics_are_named(ros):
+    for bad in (np.zeros(3), np.zeros((0, 3)), np.zeros((1, 2))):
+        with pytest.raises(ValueError, match=r'goals must have shape \(n, 3\)'):
+            GoalClient('client', bad, None)
+    with pytest.raises(ValueError, match='goal_pose takes one goal, got 2'):
+        GoalClient('client', np.zeros((2, 3)), None, topic='goal_pose')
+    with pytest.raises(ParameterError) as caught:
+        add_client(ros, [[0.0, 0.0, 0.0]], cli_args=['--ros-args', '-r', 'odom:=goal_status'])
+    assert str(caught.value) == (
+        'two topics of this node have the name /goal_status, one with type nav_msgs/msg/Odometry, the '
+        'other with action_msgs/msg/GoalStatus: remap them to different names'
+    )
+    ros.peer.create_publisher(PoseStamped, 'odom', 1)
+    with pytest.raises(ParameterError) as caught:
+        add_client(ros, [[0.0, 0.0, 0.0]])
+    assert str(caught.value) == (
+        '/odom must have one type within a process: this node uses nav_msgs/msg/Odometry, another one '
+        'geometry_msgs/msg/PoseStamped'
+    )
+
+
+def test_distance_is_that_of_the_point_the_controller_drives(ros):
+    client = add_client(ros, [[1.0, 0.0, 0.0]], topic='goal_pose')
+    node = ros.add(GoToGoal, parameters={'controller': 'offset_point', 'offset': 0.25})
+    watch = Liveness(client, ['/go_to_goal', '/missing'], DRIVEN_POINT_PARAMETERS)
+    unknown = Liveness(ros.peer, ['/go_to_goal'], ('controller', 'no_such_parameter'))
+    ros.until(lambda: watch.silence() is None or watch.values, 'the parameters are reported')
+    assert watch.values == {'/go_to_goal': {'controller': 'offset_point', 'offset': 0.25}}
+    client.set_controller_parameters(watch.values['/go_to_goal'])
+    receive(client, '/odom', odometry(0.0, 0.0, 0.0))
+    assert client.distance == 0.75
+    assert node.arrival.offset == driven_offset(watch.values['/go_to_goal'])
+    # A node without these parameters answers without values.
+    ros.until(lambda: unknown.silence() is None or unknown.answered, 'an answer')
+    assert unknown.values == {}
+    for values in (
+        {},
+        {'controller': 'pose', 'offset': 0.1},
+        {'controller': 'offset_point', 'offset': math.nan},
+        {'controller': 'offset_point', 'offset': '0.1'},
+        {'controller': 3, 'offset': None},
+    ):
+        assert driven_offset(values) == 0.0
+
+
+# --- Nodes that were killed or hang are detected within seconds, and only they
+
+
+class Clock:
+    """A monotonic clock that the test advances."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def monotonic(self):
+        return self.now
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def watch(ros, clock):
+    """Watches a controller, by that clock."""
+    return Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
+
+
+def answered(ros, watch, clock):
+    """Wait for another answer: the silence ends."""
+    watch._answered = False
+
+    def over():
+        clock.now += 0.1
+        watch.silence()
+        return watch._answered
+
+    ros.until(over, 'an answer')
+
+
+def test_a_node_that_is_not_served_falls_silent_and_comes_back(ros, clock, watch):
+    node = ros.add(GoToGoal)
+    for _ in range(3):
+        # Without odometry it answers, too.
+        answered(ros, watch, clock)
+    ros.executor.remove_node(node)
+    # Time in which this process stands still does not count.
+    before = watch.silence()
+    clock.now += 60.0
+    assert watch.silence() <= before + LONGEST_STEP
+    served = 0
+    while watch.silence() < SILENCE:
+        clock.now += 0.1
+        served += 1
+        ros.executor.spin_once(timeout_sec=0.001)
+    assert (SILENCE - LONGEST_STEP) / 0.1 - 2 <= served <= SILENCE / 0.1 + 2
+    # Requests do not pile up.
+    for _ in range(200):
+        clock.now += 1.0
+        watch.silence()
+    assert len(watch._pending) == liveness.PENDING
+    assert len(watch._clients['/go_to_goal']._pending_requests) == liveness.PENDING
+    ros.executor.add_node(node)
+    answered(ros, watch, clock)
+
+
+def test_a_node_without_parameter_services_is_never_silent(ros, clock, watch):
+    ros.add(GoToGoal, start_parameter_services=False)
+    for _ in range(100):
+        clock.now += 0.1
+        ros.executor.spin_once(timeout_sec=0.0)
+        assert watch.silence() == 0.0
+
+
+A, B, OTHER = b'a', b'b', b'o'
+ONE, TWO = {A: '/go_to_goal'}, {A: '/go_to_goal', B: '/go_to_goal'}
+RESTARTED = 'the controller /go_to_goal was restarted'
+HANGS = 'the controller /go_to_goal has not answered for 3 s: it was killed or hangs'
+
+
+def test_loss_and_duplicates():
+    for sent_to, present, silence, partial, expected in (
+        (ONE, ONE, 2.9, 2.9, None),
+        (ONE, {}, 0.0, 0.0, 'the controller is gone'),
+        (ONE, {OTHER: '/other'}, 0.0, 0.0, 'the controller is gone'),
+        (ONE, {**ONE, OTHER: '/other'}, 0.0, 9.0, None),
+        (ONE, {**ONE, OTHER: ''}, 0.0, 9.0, None),
+        ({A: ''}, {A: '', OTHER: ''}, 0.0, 0.0, None),
+        (ONE, TWO, 0.0, 2.9, None),
+        (TWO, TWO, 0.0, 9.0, None),
+        (ONE, TWO, 0.0, 3.0, RESTARTED),
+        (ONE, {B: '/go_to_goal'}, 0.0, 0.0, RESTARTED),
+        (ONE, ONE, 3.0, 3.0, HANGS),
+    ):
+        assert loss(sent_to, present, silence, {'/go_to_goal': partial}) == expected
+    for present in (ONE, {**ONE, OTHER: '/other'}, {B: '/go_to_goal'}):
+        assert duplicates(ONE, present) == []
+    assert duplicates(ONE, TWO) == ['/go_to_goal']
+
+
+def partial_silence(ros, watch, clock, seconds):
+    """Spin while some node answers, for a time of the clock; return the partial silence."""
+    end = clock.now + seconds
+
+    def over():
+        clock.now += 0.05
+        watch.silence()
+        return clock.now >= end
+
+    ros.until(over, 'the end')
+    return watch.partial_silence()['/go_to_goal']
+
+
+def two_are_discovered(ros):
+    count = ros.peer.count_services
+    ros.until(lambda: count('/go_to_goal/get_parameters') == 2, 'both are discovered')
+
+
+def test_a_duplicate_that_answers_too_is_no_restart(ros, clock, watch):
+    ros.add(GoToGoal)
+    answered(ros, watch, clock)
+    twin = ros.add(GoToGoal)
+    two_are_discovered(ros)
+    ros.until(lambda: partial_silence(ros, watch, clock, PERIOD) == 0.0, 'both have answered')
+    # Which of them falls silent now is unknown.
+    ros.executor.remove_node(twin)
+    assert partial_silence(ros, watch, clock, 2 * SILENCE) == 0.0
+
+
+def test_a_namesake_without_parameter_services_is_no_restart(ros, clock, watch):
+    ros.add(GoToGoal)
+    ros.add(GoToGoal, start_parameter_services=False)
+    answered(ros, watch, clock)
+    assert partial_silence(ros, watch, clock, 2 * SILENCE) < 1.0
+
+
+def test_a_successor_that_answers_alone_is_a_restart(ros, clock, watch):
+    old = ros.add(GoToGoal)
+    answered(ros, watch, clock)
+    ros.executor.remove_node(old)
+    ros.add(GoToGoal)
+    two_are_discovered(ros)
+    assert partial_silence(ros, watch, clock, 2 * SILENCE) >= SILENCE
+    assert watch.silence() < SILENCE
+
+
+def test_a_restarted_controller_is_distinguished_from_the_one_that_has_the_goal(ros):
+    sender = add_client(ros, [[1.0, 1.0, 0.0]], topic='goal_pose', start_parameter_services=False)
+    ros.add(GoToGoal, namespace='/here')
+    old = ros.add(GoToGoal)
+    ros.until(lambda: sender.obstacle() is None, 'the sender is ready')
+    controllers = sender.controllers()
+    assert list(controllers.values()) == ['/go_to_goal']
+    assert loss(controllers, sender.controllers(), 0.0, {}) is None
+    ros.add(GoToGoal)
+    ros.until(
+        lambda: duplicates(controllers, sender.controllers()) == ['/go_to_goal'], 'it has a namesake'
+    )
+    assert len(sender.controllers()) == 2
+    ros.executor.remove_node(old)
+    old.destroy_node()
+    ros.nodes.remove(old)
+    ros.until(lambda: len(sender.controllers()) == 1, 'the old one is gone')
+    # Within a process the name of the new one is lost with the old one.
+    assert loss(controllers, sender.controllers(), 0.0, {}) == 'the controller is gone'
+
+
+# --- Robots that have a goal and do not move
+
+
+def test_each_standstill_is_detected_once():
+    found = Standstill()
+    rest, later = np.array([1.0, 2.0, 3.14]), np.array([1.1, 2.0, 3.14])
+    assert [found.update(rest, now) for now in (0.0, 4.9, 5.0, 6.0, 20.0)] == [0, 0, 1, 0, 0]
+    # Noise and a turn of the angle are no motion.
+    found.update(later, 21.0)
+    noisy = later + np.array([0.002, -0.002, 0.001 - math.tau])
+    assert [found.update(noisy, now) for now in (25.9, 26.0, 27.0)] == [0, 1, 0]
+    # A robot without a goal may stand still.
+    found.reset()
+    assert [found.update(np.zeros(3), now) for now in (30.0, 34.9, 35.0)] == [0, 0, 1]
+    # Slow motion is none.
+    for step in ([0.006, 0.0, 0.0], [0.0, -0.006, 0.0], [0.0, 0.0, 0.011]):
+        found = Standstill()
+        assert not any(found.update(np.array(step) * now / 4.0, now) for now in range(0, 60, 2))
+
+
+def test_a_goal_of_a_robot_that_does_not_move_is_reported(monkeypatch):
+    monkeypatch.setattr(standstill, 'PATIENCE', 0.3)
+    signals, seconds = Signals(), []
+
+    class Progress(_Silent):
+        def standing(self, duration):
+            seconds.append(duration)
+            signals.count += 1
+
+    with (
+        discovery_off(),
+        ros_context(['test']) as context,
+        running(context, isolated=True) as runner,
+    ):
+        controller = runner.add(lambda: GoToGoal(context=context))
+        robot = controller.create_publisher(Odometry, 'odom', 10)
+
+        def publish():
+            message = odometry(0.0, 0.0, 0.0)
+            message.header.stamp = controller.get_clock().now().to_msg()
+            robot.publish(message)
+
+        controller.create_timer(0.02, publish)
+        target = np.array([[1.0, 0.0, 0.0]])
+        client = runner.add(lambda: GoalClient('client', target, context, topic='goal_pose'))
+        session = _Session(client, runner, signals, Progress())
+        result = session.run(10.0, 10.0, follow=True, heading_matters=False)
+    assert seconds == [0.3]
+    assert (result.result, result.canceled) == (Result.INTERRUPTED, True)
+    assert result.status is GoalState.CANCELED
+
+
+def test_the_report_does_not_claim_that_an_unknown_robot_was_stopped(capsys):
+    options = argparse.Namespace(timeout=7.0, wait=10.0, x=1.0, y=1.0)
+    values = {'result': Result.TIMEOUT, 'topic': '/goal_pose', 'status': GoalState.CANCELED}
+    unknown = GoalResult(**values, canceled=True)
+    assert _sending.report(unknown, options, 'goal (1, 1)') == [
+        'not arrived within --timeout 7 s',
+        'canceled: no odometry was received, so it is not known whether a robot drove',
+    ]
+    known = GoalResult(**values, canceled=True, distance=1.0)
+    assert _sending.report(known, options, 'goal (1, 1)')[1] == 'canceled: the robot was stopped'
+    with _sending.Progress('send_goal', 'goal (1, 1)') as progress:
+        progress.standing(5.0)
+    assert capsys.readouterr().out == 'the robot has not moved for 5 s: call doctor to find out why\n'
+
+
+# --- Messages that clients ignore
+
+
+@pytest.mark.parametrize(
+    ('codec', 'message'),
+    [
+        (GOAL_STATUS, GoalStatus()),
+        (MOTION, odometry(1.0, 2.0, 0.0)),
+        (GOALS, goals(goal(1, 0), goal(2, 0))),
+        (JOINT_STATE, JointState(name=['a', 'b'], position=[1.0, 2.0], velocity=[1.0, 2.0])),
+        (
+            PARAMETER_EVENT,
+            ParameterEvent(changed_parameters=[Parameter('a', value=[1, 2]).to_parameter_msg()] * 60),
+        ),
+    ],
+    ids=lambda one: getattr(one, 'type_name', ''),
+)
+def test_invalid_messages_are_ignored_without_a_word(codec, message, capfd):
+    """The code that rclpy generates for a type writes a line for each."""
+    received, refused = [], []
+    callback = ignoring_invalid(codec, type(message), received.append, refused.append)
+    data = serialize_message(message)
+    # rclpy adds bytes at the end.
+    for invalid in (b'\0\1', b'\xff' * len(data), *(data[:end] for end in range(0, len(data) // 2, 4))):
+        callback(invalid)
+    assert received == []
+    callback(data)
+    assert received == [value_of(codec, message)]
+    assert refused == []
+    assert capfd.readouterr() == ('', '')
+
+
+def test_an_invalid_value_is_reported_and_what_is_too_large_is_not():
+    received, refused = [], []
+    callback = ignoring_invalid(MOTION, Odometry, received.append, refused.append)
+    callback(serialize_message(odometry(1e7, 0.0, 0.0)))
+    callback(serialize_message(Odometry(child_frame_id='a' * serialization.MAX_SIZE)))
+    assert received == []
+    assert [str(one) for one in refused] == [
+        'position must be finite and within 1e+06 m, got x 1e+07, y 0'
+    ]
+
+
+def test_a_number_of_goals_that_is_too_large_is_not_decoded(monkeypatch, capfd):
+    decoded = []
+
+    def deserialize(data, kind):
+        decoded.append(data)
+        return deserialize_message(data, kind)
+
+    monkeypatch.setattr(serialization, 'deserialize_message', deserialize)
+    callback = ignoring_invalid(GOALS, Goals, lambda route: None)
+    data = bytearray(serialize_message(goals(goal(1, 0))))
+    at = data.index(struct.pack('<I', 1), 12)
+    for number in (MAX_WAYPOINTS + 1, 2**31, 2**32 - 1):
+        struct.pack_into('<I', data, at, number)
+        callback(bytes(data))
+    assert decoded == []
+    callback(serialize_message(goals(*[goal(1, 0)] * MAX_WAYPOINTS)))
+    assert len(decoded) == 1
+    assert capfd.readouterr() == ('', '')
