@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -78,7 +79,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     except OSError as error:
         return _cli.complain(PROGRAM, error)
     kept = recording is None or options.no_plot or options.force
-    if recording is not None and not kept and (picture := _picture(recording)).exists():
+    if recording is not None and not kept and os.path.lexists(picture := _picture(recording)):
         recording.discard()
         return _cli.complain(PROGRAM, f'{picture} exists already; {NOT_OVERWRITTEN}')
     outcome = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -85,7 +86,7 @@ def test_covariance_of_the_motion_is_that_of_simulated_wheels():
     drive = Drive.of([(4.0, 0.2, 0.6)])
     noise = Noise(wheel=1e-6, position=0.0, heading=0.0)
     robot = Simulation(drive=drive, noise=noise, multipliers=(1.0, 1.0, 1.0))
-    ends = np.array([relative(*robot.truth(random)[[0, -1]]) for _ in range(2000)])
+    ends = np.array([relative(*robot.truth(random)[[0, -1]]) for _ in range(1000)])
     found = increments(drive.time, drive.angles, drive.time[[0, -1]], NOMINAL)
     off = relative(np.broadcast_to(found.steps[0], ends.shape), ends)
     nees = np.einsum('ni,ij,nj->n', off, np.linalg.inv(found.covariance[0] * noise.wheel), off)
@@ -153,10 +154,11 @@ def test_umbmark_recovers_the_true_multipliers(given):
     assert result.estimate.noise.heading == pytest.approx(NOISE.heading, rel=0.15)
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance():
-    """A small form of `benchmark/calibration_cases.py`: mean squares of 16 robots."""
+    """A small form of `benchmark/calibration_cases.py`: mean squares of 8 robots."""
     errors, nees, bounds, places = [], [], [], []
-    count = 16
+    count = 8
     for seed in range(count):
         random = np.random.default_rng(100 + seed)
         result = calibrate([ROBOT.recording(random)], NOMINAL)
@@ -178,7 +180,7 @@ def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance()
         )
         bounds.append(np.diag(np.linalg.inv(information([motion], NOMINAL, known)))[:3])
     ratio = np.mean(np.square(errors) / np.array(TRUE) ** 2 / bounds, axis=0)
-    # The mean of squares of 16 numbers of variance 1 has the deviation sqrt(2 / 16).
+    # The mean of squares of 8 numbers of variance 1 has the deviation sqrt(2 / 8).
     assert (np.abs(ratio - 1.0) < 3.5 * np.sqrt(2.0 / count)).all(), ratio
     assert abs(np.mean(nees) - 3.0) < 3.5 * np.sqrt(6.0 / count)
     assert (np.abs(np.mean(np.square(places), axis=0) - 1.0) < 3.5 * np.sqrt(2.0 / count)).all(), places
@@ -201,7 +203,7 @@ def test_wheel_noise_that_is_not_known_makes_the_multipliers_less_certain():
     assert 1.001 < ratios[0] < ratios[1] < 1.2
 
 
-@pytest.mark.parametrize('sensor', [(0.1, -0.05, 1.5), (-0.2, 0.0, 3.1), (0.0, 0.3, -0.4)])
+@pytest.mark.parametrize('sensor', [(0.1, -0.05, 1.5), (-0.2, 0.3, 3.1)])
 def test_the_place_of_the_sensor_is_estimated(sensor):
     result = calibrate([replace(ROBOT, sensor=sensor).recording(np.random.default_rng(6))], NOMINAL)
     assert_true(result)
@@ -217,7 +219,7 @@ def test_a_sensor_that_is_wrongly_given_makes_worse_estimates():
     assert wrong.estimate.noise.position > 1.5 * result.estimate.noise.position
 
 
-@pytest.mark.parametrize('delay', [0.08, -1.7, 12.3, 40.0, -60.0, 1e4])
+@pytest.mark.parametrize('delay', [0.08, -1.7, 40.0, 1e4])
 def test_the_offset_between_the_clocks_is_estimated(delay):
     recording = replace(ROBOT, delay=delay).recording(np.random.default_rng(7))
     result = calibrate([recording], NOMINAL)
@@ -231,7 +233,7 @@ SIDE = 5.0 + np.pi / 2.0
 """Time after which these laps repeat themselves (s)."""
 
 
-@pytest.mark.parametrize('delay', [0.0, 2.0, -2.0])
+@pytest.mark.parametrize('delay', [2.0, -2.0])
 def test_equal_laps_have_the_offset_that_is_nearest_to_zero(delay):
     recording = replace(LAPS, delay=delay).recording(np.random.default_rng(7))
     result = calibrate([recording], NOMINAL)
@@ -239,7 +241,7 @@ def test_equal_laps_have_the_offset_that_is_nearest_to_zero(delay):
     assert result.time_offsets[0] == pytest.approx(delay, abs=0.05)
 
 
-@pytest.mark.parametrize('delay', [0.7 * SIDE, -SIDE, 4.2 * SIDE])
+@pytest.mark.parametrize('delay', [-SIDE, 4.2 * SIDE])
 def test_an_offset_is_refused_where_the_motion_agrees_with_a_nearer_one(delay):
     recording = replace(LAPS, delay=delay).recording(np.random.default_rng(7))
     with pytest.raises(CalibrationError, match=r'several time offsets.*--time-offset') as refused:
@@ -332,10 +334,10 @@ def test_angles_that_change_with_each_sample_are_taken_as_they_are():
         assert not deviations.any()
 
 
-@pytest.mark.parametrize('steps', [16, 32])
+@pytest.mark.parametrize('steps', [16])
 def test_wheels_are_located_between_the_steps_of_their_encoders(steps):
     random = np.random.default_rng(20)
-    drive = Drive.of(with_stops(umbmark(runs=4)))
+    drive = Drive.of(with_stops(umbmark(runs=2)))
     errors, deviations = [], []
     for readings, angles in zip(stepped(drive.angles, steps, random).T, drive.angles.T, strict=True):
         found, deviation = located(drive.time, readings)
@@ -350,11 +352,12 @@ def test_wheels_are_located_between_the_steps_of_their_encoders(steps):
     assert error[deviation == 0.0].std() < 0.5 * deviation.max()
 
 
+@pytest.mark.slow
 def test_few_steps_make_the_multipliers_uncertain_and_not_wrong():
     random = np.random.default_rng(21)
     robot = replace(ROBOT, drive=Drive.of(with_stops(umbmark(side=1.0, runs=1))), rate=5)
     errors, nees, widths = [], [], []
-    count = 6
+    count = 3
     for _ in range(count):
         exact = robot.recording(random)
         coarse = replace(exact, wheel_angles=stepped(exact.wheel_angles, 16, random))
@@ -424,8 +427,9 @@ def test_a_drive_that_determines_nothing_is_described():
 # --- Bad input
 
 
-def base(seed=13):
-    return replace(ROBOT, rate=10).recording(np.random.default_rng(seed))
+@cache
+def base():
+    return replace(ROBOT, rate=10).recording(np.random.default_rng(13))
 
 
 def test_a_jump_of_the_reference_is_noted_and_does_no_harm():
@@ -504,7 +508,7 @@ def test_swapped_wheels_are_not_taken_for_an_offset():
 
 
 @pytest.mark.parametrize(
-    ('scale', 'name'), [(3.2808, 'feet'), (1.4, 'another unit'), (39.37, 'inches'), (1e3, 'millimetres')]
+    ('scale', 'name'), [(3.2808, 'feet'), (1.4, 'another unit'), (1e3, 'millimetres')]
 )
 def test_a_reference_in_another_unit_is_noted_or_refused(scale, name):
     recording = base()
@@ -545,6 +549,7 @@ def test_faults_are_named(what, words):
         calibrate([spoiled(base(), what)], NOMINAL)
 
 
+@pytest.mark.slow
 def test_wheels_at_a_low_rate_and_slip_are_noted():
     recording = base()
     rare = replace(

@@ -8,7 +8,7 @@ import pytest
 from diffdrive_jacobian.calibration.normal_equations import solve_block_tridiagonal
 
 
-@pytest.mark.parametrize('count', [1, 2, 3, 4, 5, 6, 7, 8, 13, 16, 17, 100])
+@pytest.mark.parametrize('count', [1, 2, 3, 4, 5, 8, 13, 17])
 def test_equals_dense_linear_algebra(count):
     random = np.random.default_rng(count)
     diagonal, upper = random.standard_normal((count, 3, 3)), random.standard_normal((count - 1, 3, 3))

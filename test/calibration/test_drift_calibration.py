@@ -48,50 +48,34 @@ def driven(path, assumed=None, **multipliers):
         return np.array(ends)
 
 
-@pytest.fixture(scope='module')
-def uncalibrated(tmp_path_factory):
-    path = tmp_path_factory.mktemp('bags') / 'umbmark'
-    return path, driven(path)
+@pytest.mark.slow
+def test_a_robot_is_calibrated_with_its_bag(tmp_path):
+    nominal = Geometry(wheel_radius=0.033, wheel_separation=0.16)
+    path, again = tmp_path / 'umbmark', tmp_path / 'again'
 
+    def assert_true(found):
+        sigma = np.sqrt(np.diag(found.covariance)[:3])
+        assert found.undetermined == []
+        assert np.all(np.abs(found.multipliers - TRUE) < 4.0 * sigma)
+        assert np.all(sigma < 0.01)
 
-def test_the_multipliers_of_a_robot_come_out_of_its_bag(uncalibrated, tmp_path):
-    path, ends = uncalibrated
+    ends = [driven(path)]
     read = read_wheels_and_reference(path)
     assert read.reference_topic == '/ground_truth'
-    found = calibrate([read.recording], Geometry(wheel_radius=0.033, wheel_separation=0.16))
-    sigma = np.sqrt(np.diag(found.covariance)[:3])
-    assert found.undetermined == []
-    assert np.all(np.abs(found.multipliers - TRUE) < 4.0 * sigma)
-    assert np.all(sigma < 0.01)
-    # Wheels that are driven with them bring the robot back.
-    left, right, separation = found.multipliers.tolist()
-    again = driven(
-        tmp_path / 'again',
-        left_wheel_radius_multiplier=left,
-        right_wheel_radius_multiplier=right,
-        wheel_separation_multiplier=separation,
-    )
-    before, after = (max(math.hypot(x, y) for x, y, _ in one) for one in (ends, again))
+    found = calibrate([read.recording], nominal)
+    assert_true(found)
+    # Wheels that are driven with them bring the robot back, to where its odometry says.
+    assumed = dict(zip(PARAMETERS, found.multipliers.tolist(), strict=True))
+    ends.append(driven(again, assumed, **assumed))
+    before, after = (max(math.hypot(x, y) for x, y, _ in one) for one in ends)
     assert before > 0.1
     assert after < before / 3.0
-
-
-def test_a_calibrated_robot_is_where_its_odometry_says(uncalibrated, tmp_path):
-    path, _ = uncalibrated
-    nominal = Geometry(wheel_radius=0.033, wheel_separation=0.16)
-    found = calibrate([read_wheels_and_reference(path).recording], nominal)
-    assumed = dict(zip(PARAMETERS, found.multipliers.tolist(), strict=True))
-    again = tmp_path / 'again'
-    driven(again, assumed, **assumed)
     apart = []
     for run in map(read_run, (path, again)):
         verification = verify(run)
         assert verification.truth is not None
         assert verification.holds(1e-9, 1e-9)
-        off = run.odometry.values[-1, :2] - run.ground_truth.values[-1, :2]
-        apart.append(math.hypot(*off))
+        apart.append(math.dist(run.odometry.values[-1, :2], run.ground_truth.values[-1, :2]))
     assert apart[1] < apart[0] / 3.0
     # The multipliers refer to the nominal dimensions, so that those of the robot are found again.
-    second = calibrate([read_wheels_and_reference(again).recording], nominal)
-    sigma = np.sqrt(np.diag(second.covariance))
-    assert np.all(np.abs(second.multipliers - TRUE) < 4.0 * sigma)
+    assert_true(calibrate([read_wheels_and_reference(again).recording], nominal))

@@ -182,6 +182,7 @@ def test_what_is_no_run(tmp_path):
         read_robots(tmp_path / 'none')
 
 
+@pytest.mark.process
 def test_a_bag_is_watched_without_ros():
     """In an interpreter of its own."""
     program = 'import sys, diffdrive_jacobian.live.serving, diffdrive_jacobian.tools.watch_run\n'

@@ -17,6 +17,8 @@ from chromium import Browser, find_chromium, until
 from support import processes
 from support.processes import open_world
 
+pytestmark = [pytest.mark.browser, pytest.mark.process]
+
 QUICK = ('--ros-args', '-p', 'go_to_goal:kp:=8.0', '-p', 'go_to_goal:kv:=4.0')
 
 if find_chromium() is None and not os.environ.get('CHROMIUM_REQUIRED'):

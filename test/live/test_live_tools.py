@@ -37,6 +37,7 @@ def robots(page):
     return {one['name']: one for one in json.loads(page.recv(timeout=20))['robots']}
 
 
+@pytest.mark.process
 def test_watch_run_beside_nodes_and_the_robot_stops_with_the_page(world):
     """In processes of their own, by DDS. It ends by Ctrl-C, and so does driving by hand."""
     robot = world.start('virtual_robot', '--ros-args', '-r', '__ns:=/r')
@@ -61,6 +62,7 @@ def test_watch_run_beside_nodes_and_the_robot_stops_with_the_page(world):
     assert robot.exit() == 0
 
 
+@pytest.mark.process
 def test_drive_to_live_waits_for_the_page_records_and_ends_by_a_signal(world, tmp_path):
     bag = str(tmp_path / 'bag')
     drive = world.start(
@@ -90,6 +92,7 @@ def test_drive_to_live_waits_for_the_page_records_and_ends_by_a_signal(world, tm
     assert watch.exit() == 0
 
 
+@pytest.mark.process
 def test_drive_to_live_in_real_time(world):
     drive = world.start('drive_to', '0.1', '0', '--live', '--no-record', '--no-browser', *QUICK)
     with opened(drive) as page:
@@ -100,29 +103,6 @@ def test_drive_to_live_in_real_time(world):
 
 
 # --- Arguments
-
-
-@pytest.mark.parametrize(
-    ('tool', 'arguments', 'message'),
-    [
-        (watch_run, ['--port', '0'], 'must be an integer from 1 to 65535, got 0'),
-        (watch_run, ['--port', '99999'], 'must be an integer from 1 to 65535, got 99999'),
-        (watch_run, ['--rate', '2'], '--rate needs a BAG'),
-        (watch_run, ['bag', '--rate', '-2'], 'must be in [0.01, 1000], got -2.0'),
-        (watch_run, ['bag', '--rate', '1e9'], 'must be in [0.01, 1000], got 1000000000.0'),
-        (watch_run, ['bag', '--ros-args', '-p', 'x:=1'], 'a BAG needs no ROS arguments'),
-        (drive_to, [], 'X Y or --path (only --live needs no goal)'),
-        (drive_to, ['1', '1', '--no-browser'], 'are options of --live'),
-        (drive_to, ['1', '1', '--port', '8000'], 'are options of --live'),
-        (drive_to, ['1', '1', '--live', '--lockstep', '--open'], 'exclude each other'),
-        (drive_to, ['--live', '--timeout', '5'], '--timeout has no effect with --live'),
-    ],
-)
-def test_wrong_arguments(capsys, tool, arguments, message):
-    with pytest.raises(SystemExit) as ended:
-        tool.main(arguments, Signals())
-    assert ended.value.code == 2
-    assert message in capsys.readouterr().err
 
 
 def test_a_port_in_use_a_bag_that_is_none_and_a_missing_library(capsys, tmp_path, monkeypatch):

@@ -87,6 +87,7 @@ def test_transports_with_udp_are_no_other_choice(transports, monkeypatch):
     assert announce_frequently()
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(('switch', 'expected'), [('1', False), ('0', True)])
 def test_messages_are_received_through_udp(switch, expected, monkeypatch):
     """A sender then needs no check of shared memory, which often takes 0.33 s."""
@@ -147,6 +148,7 @@ def test_the_variable_is_gone_when_the_first_node_exists():
         assert VARIABLE not in os.environ
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(('switch', 'expected'), [('', 'announcements.xml'), ('0', 'none')])
 def test_entry_points_announce_themselves(switch, expected):
     ended = subprocess.run(

@@ -39,6 +39,7 @@ def start(together):
     return child
 
 
+@pytest.mark.process
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_second_signal_ends_a_process_that_hangs(number):
     child = start(0.0)
@@ -70,6 +71,7 @@ print('counted', caught.count, flush=True)
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ('when', 'code', 'printed'),
     [('before', 7, ''), ('while', 7, 'reached\n'), ('after', 0, 'reached\ncounted 1\n')],

@@ -146,14 +146,6 @@ def test_nothing_is_driven_once_the_drive_is_over(tmp_path, capsys):
     assert not run.cmd_vel_out.values.any()
 
 
-def test_an_existing_picture_is_reported_before_the_drive(tmp_path, capsys):
-    (tmp_path / 'bag.png').write_text('precious')
-    assert drive_to.main(['1', '1', '--lockstep', '-o', 'bag'], Signals()) == 2
-    assert 'bag.png exists already' in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ['bag.png']
-    assert (tmp_path / 'bag.png').read_text() == 'precious'
-
-
 def test_timeout_is_of_simulated_time(capsys):
     assert drive_to.main(['50', '0', '--lockstep', '--no-record', '--timeout', '3'], Signals()) == 1
     line = last_line(capsys)
@@ -210,25 +202,7 @@ def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
     assert (tmp_path / 'bag').is_dir()
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        (['--open'], '--lockstep and --open exclude each other'),
-        (['--controller', 'pid'], "'go_to_goal', 'offset_point', 'pose'"),
-        (['--heading', 'nan'], 'argument --heading: must be finite, got nan'),
-        (['--ros-args', '-p', 'wheel_radius:=-1.0'], "parameter 'wheel_radius' must be in [0.001, 10]"),
-        (['--ros-args', '--no-such-option'], 'ROS arguments: '),
-    ],
-)
-def test_wrong_arguments_are_reported(capsys, arguments, words):
-    with pytest.raises(SystemExit) as caught:
-        raise SystemExit(drive_to.main(['1', '1', '--lockstep', '--no-record', *arguments], Signals()))
-    assert caught.value.code == 2
-    line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith('drive_to: error: ')
-    assert words in line
-
-
+@pytest.mark.process
 def test_ends_on_a_signal(tmp_path):
     signals = (signal.SIGINT, signal.SIGTERM)
     with open_world(tmp_path) as world:

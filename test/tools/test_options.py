@@ -2,56 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
-import importlib
 import math
 import os
 from pathlib import Path
 
 import pytest
+from support.commands import refused, run
 
-from diffdrive_jacobian import __version__
 from diffdrive_jacobian.parameters.configurations import configurations
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli, _messages, _options, entry_points
+from diffdrive_jacobian.tools import _messages
 
 CONFIGS = Path(__file__).parents[2] / 'config'
-
-
-def run(tool, *arguments):
-    """Run a tool in this process; return its exit code."""
-    module = importlib.import_module(f'diffdrive_jacobian.tools.{tool}')
-    try:
-        return module.main([str(one) for one in arguments], Signals())
-    except SystemExit as end:
-        return end.code
-
-
-def refused(capsys, tool, *arguments):
-    """Give the message with which arguments are refused."""
-    assert run(tool, *arguments) == 2
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith(f'{tool}: error: ')
-    return last.removeprefix(f'{tool}: error: ')
-
-
-# --- --version
-
-
-@pytest.mark.parametrize('tool', entry_points.tools())
-def test_every_tool_prints_its_version(capsys, tool):
-    assert run(tool, '--version') == 0
-    assert capsys.readouterr().out == f'{tool} (diffdrive_jacobian) {__version__}\n'
-
-
-@pytest.mark.parametrize('node', entry_points.NODES)
-def test_every_node_prints_its_version(capsys, node):
-    from diffdrive_jacobian.tools.run_node import run_node
-
-    with pytest.raises(SystemExit) as end:
-        run_node(node, ['--version'], Signals())
-    assert end.value.code == 0
-    assert capsys.readouterr().out == f'{node} (diffdrive_jacobian) {__version__}\n'
 
 
 # --- --robot
@@ -83,104 +45,6 @@ def test_the_configurations_of_an_installation_are_found(tmp_path, monkeypatch):
     monkeypatch.setattr(module, '__file__', str(site / 'a' / 'b' / 'c.py'))
     monkeypatch.setattr(module, '_listed_files', lambda: pytest.fail('it reads the list'))
     assert configurations() == {'rover': folder / 'rover.yaml'}
-
-
-def test_robot_stands_for_its_parameter_file(capsys):
-    parser = _cli.Parser(prog='x')
-    _options.add_params_file(parser)
-    options = parser.parse_args(['--robot', 'turtlebot3_burger'])
-    assert Path(options.params_file).read_text() == (CONFIGS / 'turtlebot3_burger.yaml').read_text()
-    assert 'create3, turtlebot3_burger' in ' '.join(parser.format_help().split())
-
-
-def test_another_robot_is_refused_with_those_there_are(capsys):
-    assert "must be one of 'create3', 'turtlebot3_burger', got" in refused(
-        capsys, 'drive_to', 1, 1, '--robot', 'r2d2'
-    )
-    file = CONFIGS / 'create3.yaml'
-    both = ('--robot', 'create3', '--params-file', file)
-    assert 'not allowed with argument' in refused(capsys, 'drive_to', 1, 1, *both)
-
-
-# --- Headings
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'expected'),
-    [
-        ([], None),
-        (['--heading', '1.5'], 1.5),
-        (['--heading', '-6.2'], -6.2),
-        (['--heading', '90', '--degrees'], math.pi / 2),
-        (['--degrees', '--heading', ' -360'], -math.tau),
-    ],
-)
-def test_headings_are_in_radians_or_degrees(arguments, expected):
-    parser = _cli.Parser(prog='x')
-    _options.add_heading(parser, 'heading')
-    assert _options.given_heading(parser, parser.parse_args(arguments)) == expected
-
-
-@pytest.mark.parametrize('tool', ['drive_to', 'send_goal'])
-def test_headings_in_the_wrong_unit_are_refused(capsys, tool):
-    assert '--degrees accepts them' in refused(capsys, tool, 1, 1, '--heading', 90)
-    assert 'from -360 to 360 degrees' in refused(capsys, tool, 1, 1, '--heading', 400, '--degrees')
-    assert '--degrees needs --heading' in refused(capsys, tool, 1, 1, '--degrees')
-
-
-# --- Options without effect
-
-
-@pytest.mark.parametrize(
-    ('tool', 'arguments', 'words'),
-    [
-        ('drive_to', '1 1 --no-record -o run', '--output has no effect with --no-record'),
-        ('drive_to', '1 1 --no-record --force', '--force has no effect with --no-record'),
-        ('drive_to', '1 1 --force', '--force has no effect without --output'),
-        ('send_path', 'circle:1 --no-wait --timeout 5', '--timeout has no effect with --no-wait'),
-        ('send_path', 'circle:0', 'size of a shape must be a positive number'),
-        ('send_path', 'missing.csv', 'missing.csv: there is no such file'),
-        ('send_path', 'square:1', 'path must be circle:RADIUS, line:LENGTH, eight:SIZE'),
-        ('drive_to', '--path circle:1 1 1', '--path excludes X Y and --heading'),
-        ('drive_to', '--path circle:1 --heading 1', '--path excludes X Y and --heading'),
-        ('drive_to', '1 1 --speed 0.3', '--speed has no effect without --path'),
-        ('drive_to', '1 1 --path-controller kanayama', '--path-controller has no effect without'),
-        ('drive_to', '--path circle:1 --path-controller mine', 'kanayama'),
-        ('drive_to', '--path poses.txt', 'the name of a .csv or .yaml file'),
-        ('send_goal', '1 1 --no-wait --timeout 5', '--timeout has no effect with --no-wait'),
-        ('record_run', '--force', '--force has no effect without --output'),
-        ('record_run', '--all -e odom', '--regex has no effect with --all'),
-        ('record_run', 'odom --all', 'TOPIC has no effect with --all'),
-        ('replay_run', 'run --timeout 1', '--timeout needs -w'),
-        ('replay_run', 'run --topics /a --namespace b', '--namespace has no effect with --topics'),
-        (
-            'replay_run',
-            'run --loop --wait-for-all-acked 1',
-            '--wait-for-all-acked has no effect with --loop',
-        ),
-        ('replay_run', 'run --start-paused', '--start-paused needs a terminal'),
-        ('sweep_gains', '--force', '--force has no effect without --output or --csv'),
-        ('plot_run', 'run --topic odom=/a --topic odom=/b', '--topic can be given once for each name'),
-        ('plot_run', 'run --namespace a-b', 'must be a namespace'),
-    ],
-)
-def test_options_without_effect_are_refused(capsys, tmp_path, monkeypatch, tool, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    assert words in refused(capsys, tool, *arguments.split())
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ('text', 'expected'), [('robot1', '/robot1'), ('/a/b/', '/a/b'), ('/', '/'), ('', '/')]
-)
-def test_namespaces(text, expected):
-    assert _options.namespace(text) == expected
-
-
-@pytest.mark.parametrize('text', ['a b', '1a', 'a//b', 'a-b'])
-def test_names_that_are_no_namespace(text):
-    with pytest.raises(argparse.ArgumentTypeError):
-        _options.namespace(text)
 
 
 # --- Bags of several robots
@@ -230,26 +94,25 @@ def test_a_bag_of_several_robots_is_read_by_namespace(robots):
         read_run(robots, namespace='/three')
 
 
-def test_verify_run_verifies_each_of_several_robots(robots, capsys):
+def test_verify_run_verifies_each_of_several_robots(robots):
     for name in ('one', '/two'):
-        assert run('verify_run', robots, '--namespace', name) == 0
-        assert 'moves as recorded' in capsys.readouterr().out
-        assert run('replay_run', robots, '--verify', '--namespace', name) == 0
-        capsys.readouterr()
-    assert 'one namespace (--namespace)' in refused(capsys, 'verify_run', robots)
+        for tool in (('verify_run',), ('replay_run', '--verify')):
+            ended = run(*tool, robots, '--namespace', name)
+            assert (ended.code, 'moves as recorded' in ended.out) == (0, True)
+    assert 'one namespace (--namespace)' in refused('verify_run', robots)
 
 
-def test_parameters_that_a_verification_does_not_use_are_refused(robots, capsys):
+def test_parameters_that_a_verification_does_not_use_are_refused(robots):
     arguments = (robots, '--namespace', 'one', '--robot', 'create3')
-    assert 'have no effect: the bag has cmd_vel_out' in refused(capsys, 'verify_run', *arguments)
+    assert 'have no effect: the bag has cmd_vel_out' in refused('verify_run', *arguments)
 
 
-def test_plot_run_writes_one_of_several_robots(robots, capsys, monkeypatch):
+def test_plot_run_writes_one_of_several_robots(robots, monkeypatch):
     from diffdrive_jacobian.tools import plot_run
 
     drawn = []
     monkeypatch.setattr(plot_run, 'draw', lambda runs, path, **_: drawn.append((runs[0], path)))
-    assert run('plot_run', robots, '--namespace', 'two') == 0
+    assert run('plot_run', robots, '--namespace', 'two').code == 0
     ((data, path),) = drawn
     assert (round(data.odometry.values[0, 0]), path.name) == (5, 'two_two.png')
 
@@ -322,9 +185,9 @@ def test_a_directory_that_is_no_bag_is_never_replaced(tmp_path, content):
         open_recording('run', str(tmp_path / 'link'), 'mcap', replace=True)
 
 
-def test_recover_run_never_replaces_the_bag_to_recover(robots, capsys):
+def test_recover_run_never_replaces_the_bag_to_recover(robots):
     arguments = (robots, '-o', robots, '--force')
-    assert 'is the bag to recover: it is not replaced' in refused(capsys, 'recover_run', *arguments)
+    assert 'is the bag to recover: it is not replaced' in refused('recover_run', *arguments)
 
 
 @pytest.fixture
@@ -335,23 +198,23 @@ def undrawn(monkeypatch):
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_drive_to_replaces_bag_and_picture(tmp_path, monkeypatch, capsys):
+def test_drive_to_replaces_bag_and_picture(tmp_path, monkeypatch):
     from diffdrive_jacobian.bags import read_run
 
     pytest.importorskip('matplotlib')
     monkeypatch.chdir(tmp_path)
     arguments = ('--lockstep', '-o', 'run', '--tolerance', '0.05')
-    assert run('drive_to', '0.1', '0', *arguments, '--no-plot') == 0
+    assert run('drive_to', '0.1', '0', *arguments, '--no-plot').code == 0
     (tmp_path / 'run.png').write_text('old')
-    assert 'run exists already' in refused(capsys, 'drive_to', '0.2', '0', *arguments)
-    assert run('drive_to', '0.2', '0', *arguments, '--force') == 0
+    assert 'run exists already' in refused('drive_to', '0.2', '0', *arguments)
+    assert run('drive_to', '0.2', '0', *arguments, '--force').code == 0
     assert read_run(tmp_path / 'run').goals.values[0, 0] == 0.2
     assert (tmp_path / 'run.png').read_bytes() == b'picture'
     assert sorted(one.name for one in tmp_path.iterdir()) == ['run', 'run.png']
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_plot_run_and_sweep_gains_overwrite_files_only(tmp_path, robots, capsys, monkeypatch):
+def test_plot_run_and_sweep_gains_overwrite_files_only(tmp_path, robots, monkeypatch):
     pytest.importorskip('matplotlib')
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'a.png').write_text('old')
@@ -360,14 +223,19 @@ def test_plot_run_and_sweep_gains_overwrite_files_only(tmp_path, robots, capsys,
     plot = ('plot_run', robots, '--namespace', 'one', '-o')
     sweep = ('sweep_gains', '--grid', 2, '--starts', 1, '--duration', 1, '--csv')
     for command in ((*plot, 'a.png'), (*sweep, 'a.csv')):
-        assert '--force overwrites files' in refused(capsys, *command)
-        assert run(*command, '--force') == 0
+        assert '--force overwrites files' in refused(*command)
+        assert run(*command, '--force').code == 0
     assert (tmp_path / 'a.png').read_bytes() == b'picture'
     assert (tmp_path / 'a.csv').read_text().startswith('kp_per_s')
-    assert run(*plot, 'b.png', '--force') == 2
+    assert run(*plot, 'b.png', '--force').code == 2
 
 
 # --- Waiting
+
+
+def test_numbers_agree_with_their_nouns():
+    counted = [_messages.counted(number, 'topic') for number in (0, 1, 2)]
+    assert counted == ['0 topics', '1 topic', '2 topics']
 
 
 def test_what_is_waited_for_is_said_after_half_a_second_of_each_wait(monkeypatch, capsys):

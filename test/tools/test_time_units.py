@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import ast
-import re
-from pathlib import Path
-
 import pytest
 
-import diffdrive_jacobian
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds, seconds
 
 
@@ -34,17 +29,3 @@ def test_the_longest_duration_is_finite():
 
 def test_timestamps_survive_the_round_trip():
     assert nanoseconds(seconds(1_700_000_000 * NANOSECONDS)) == 1_700_000_000 * NANOSECONDS
-
-
-def test_the_unit_is_defined_once():
-    package = Path(diffdrive_jacobian.__file__).parent
-    texts = {path: path.read_text(encoding='utf-8') for path in package.rglob('*.py')}
-    defined = [
-        str(path.relative_to(package))
-        for path, text in texts.items()
-        # To parse a module takes long. Without such a literal it has no such constant.
-        if re.search(r'1(_?0){9}|0[xob]', text, re.IGNORECASE)
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Constant) and type(node.value) is int and node.value == 1_000_000_000
-    ]
-    assert defined == ['time_units.py']

@@ -6,14 +6,15 @@ come with ROS or with the extra `jazzy`.
 
 from __future__ import annotations
 
+import json
 import shutil
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 from fork_server import forked
 from rclpy.serialization import serialize_message
-from support.bags import SECOND, changed, odom, start, status, write_bag
+from support.bags import REAL, SECOND, changed, odom, start, status, write_bag
+from support.commands import COMMANDS, error_of, run_each
 from support.ros_messages import goal, goals, joint_command, twist_stamped
 
 from diffdrive_jacobian.bags import read_run, verify
@@ -21,21 +22,17 @@ from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message
 from diffdrive_jacobian.bags.message_definitions import known_definition
 from diffdrive_jacobian.tools.entry_points import ROS_MODULES
 
+pytestmark = pytest.mark.process
+
 CONFIG = Path(__file__).parents[2] / 'config' / 'turtlebot3_burger.yaml'
-TOOLS = sorted(
-    one.name
-    for one in entry_points(group='console_scripts')
-    if one.value.startswith('diffdrive_jacobian.')
-)
-WITHOUT_ROS = (
-    *('calibrate_run', 'plot_jacobian', 'plot_run', 'recover_run', 'sweep_gains', 'verify_run'),
-)
-BAG = Path(__file__).parents[1] / 'bags' / 'turtlebot3_fake_sqlite'
-"""Recorded with ros2 bag record."""
+WITHOUT_ROS = {'calibrate_run', 'plot_jacobian', 'plot_run', 'recover_run', 'sweep_gains', 'verify_run'}
+ARGUMENTS = {'send_goal': (1, 1), 'send_path': ('circle:1',), 'drive_to': (1, 1), 'replay_run': (REAL,)}
 READ = """
+import json, sys
 from diffdrive_jacobian.bags import read_run, verify
-run = read_run(sys.argv[1])
-print(len(run.odometry), run.skipped, repr(run.odometry.values.sum()), verify(run).source)
+for path in sys.argv[1:]:
+    run = read_run(path)
+    print(json.dumps([len(run.odometry), run.odometry.values.sum(), verify(run).source]))
 """
 ABSENT = """
 import sys
@@ -47,130 +44,105 @@ class Absent:
 
 sys.meta_path.insert(0, Absent())
 """
-RUN = """
-from diffdrive_jacobian.tools import entry_points
-sys.exit(getattr(entry_points, {tool!r})())
-"""
-HIDDEN = (*ROS_MODULES, 'rpyutils')
+HIDDEN = ABSENT.format(modules=(*ROS_MODULES, 'rpyutils'))
 
 
-def execute(program, *arguments, modules=HIDDEN, **kwargs):
-    """Run a program without some packages, in a fork of a process that has never imported them."""
-    return forked.run(
-        ABSENT.format(modules=modules) + program,
-        arguments,
-        modules=forked.LIBRARIES if modules == HIDDEN else (),
-        timeout=60,
-        **kwargs,
-    )
+def without_ros(*calls, **kwargs):
+    """Run commands in a fork of a process that has never imported ROS."""
+    return run_each(calls, HIDDEN, modules=forked.LIBRARIES, **kwargs)
 
 
-def run(tool, *arguments, **kwargs):
-    return execute(RUN.format(tool=tool), *arguments, **kwargs)
-
-
-def test_every_tool_is_known():
-    assert {'drive_to', 'go_to_goal', 'sweep_gains', 'virtual_robot', 'wheel_bridge'} <= set(TOOLS)
-
-
-@pytest.mark.parametrize('tool', [tool for tool in TOOLS if tool not in WITHOUT_ROS])
-def test_one_line_reports_the_remedy(tmp_path, tool):
-    arguments = {
-        'send_goal': ('1', '1'),
-        'send_path': ('circle:1',),
-        'drive_to': ('1', '1'),
-    }.get(tool, ())
-    if tool == 'replay_run':
-        arguments = (tmp_path,)
-    ended = run(tool, *arguments, cwd=tmp_path)
-    assert (ended.returncode, ended.stdout) == (1, '')
-    assert ended.stderr.count('\n') == 1
-    assert ended.stderr.startswith(f'{tool}: error: ROS 2 is not available, there is no Python module ')
-    assert 'source the setup file' in ended.stderr
-    assert "pip install '.[jazzy]'" in ended.stderr
+def test_one_line_reports_the_remedy_and_help_needs_no_ros(tmp_path):
+    ros = [command for command in COMMANDS if command not in WITHOUT_ROS]
+    assert len(ros) == len(COMMANDS) - len(WITHOUT_ROS)
+    calls = [(command, '--help') for command in COMMANDS]
+    calls += [(command, *ARGUMENTS.get(command, ())) for command in ros]
+    for (command, *arguments), ended in zip(calls, without_ros(*calls, cwd=tmp_path), strict=True):
+        if '--help' in arguments:
+            assert (ended.code, ended.err) == (0, '')
+            assert ended.out.startswith(f'usage: {command} ')
+            continue
+        assert (ended.code, ended.out, ended.err.count('\n')) == (1, '', 1), command
+        message = error_of(command, ended)
+        assert message.startswith('ROS 2 is not available, there is no Python module ')
+        assert 'source the setup file' in message
+        assert "pip install '.[jazzy]'" in message
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize('tool', TOOLS)
-def test_help_and_wrong_arguments_need_no_ros(tool):
-    helped, mistaken = run(tool, '--help'), run(tool, '--bogus')
-    assert (helped.returncode, helped.stderr) == (0, '')
-    assert helped.stdout.startswith(f'usage: {tool} ')
-    assert mistaken.returncode == 2
-    assert mistaken.stderr.splitlines()[-1].startswith(f'{tool}: error: ')
-
-
-def test_gains_are_swept_without_ros(tmp_path):
-    arguments = ('--grid', '2', '--starts', '2', '--rate', '10', '--params-file', CONFIG)
-    ended = run('sweep_gains', *arguments, cwd=tmp_path)
-    assert (ended.returncode, ended.stderr) == (0, '')
-    assert sorted(one.suffix for one in tmp_path.iterdir()) == ['.csv', '.png']
-    refused = run('sweep_gains', '--tolerance', '0', cwd=tmp_path)
-    assert refused.stderr.splitlines()[-1].startswith('sweep_gains: error: ')
-
-
-# --- Runs
-
-
-@pytest.fixture(scope='module', params=['ours', 'ros2 bag record'])
-def bag(request, tmp_path_factory):
-    if request.param != 'ours':
-        return BAG
-    # Written here with rclpy; it is read where there is none.
+@pytest.fixture(scope='module')
+def ours(tmp_path_factory):
+    """A bag that is written here with rclpy. It is read where there is none."""
+    sent = [
+        (1.0, '/start_pose', start(0.0, 0.0, 0.0, seconds=1.0)),
+        (1.0, '/cmd_vel_out', twist_stamped(0.5, 0.0, SECOND)),
+        (1.05, '/goals', goals(goal(0.2, 0.0), goal(0.5, 0.0), stamp=1)),
+        (1.06, '/goal_status', status(2, seconds=1)),
+        (1.5, '/parameter_events', changed('/virtual_robot', 'wheel_radius', 0.04)),
+    ]
+    for at in (1.1 + index / 20 for index in range(20)):
+        sent.append((at, '/odom', odom(0.5 * (at - 1.0), 0.0, 0.0, 0.5, seconds=at)))
+        sent.append((at, '/joint_states', joint_command(10.0, 10.0, round(at * SECOND))))
     return write_bag(
         tmp_path_factory.mktemp('bags') / 'run',
-        sorted(everything(), key=lambda one: one[0]),
+        sorted(sent, key=lambda one: one[0]),
         parameters={'/virtual_robot': {'wheel_radius': 0.03}},
     )
 
 
-def everything():
-    yield 1.0, '/start_pose', start(0.0, 0.0, 0.0, seconds=1.0)
-    yield 1.0, '/cmd_vel_out', twist_stamped(0.5, 0.0, SECOND)
-    yield 1.05, '/goals', goals(goal(0.2, 0.0), goal(0.5, 0.0), stamp=1)
-    yield 1.06, '/goal_status', status(2, seconds=1)
-    yield 1.5, '/parameter_events', changed('/virtual_robot', 'wheel_radius', 0.04)
-    for index in range(20):
-        at = 1.1 + index / 20
-        yield at, '/odom', odom(0.5 * (at - 1.0), 0.0, 0.0, 0.5, seconds=at)
-        yield at, '/joint_states', joint_command(10.0, 10.0, round(at * SECOND))
+def test_runs_are_read_and_verified(ours):
+    ended = forked.run(HIDDEN + READ, (ours, REAL), modules=forked.LIBRARIES, timeout=60)
+    expected = [
+        [len(run.odometry), run.odometry.values.sum(), verify(run).source]
+        for run in map(read_run, (ours, REAL))
+    ]
+    assert ([json.loads(line) for line in ended.stdout.splitlines()], ended.stderr) == (expected, '')
 
 
-def test_a_run_is_read_and_verified_without_ros(bag):
-    ended = execute(READ, bag)
-    expected = read_run(bag)
-    told = (
-        f'{len(expected.odometry)} {{}} {expected.odometry.values.sum()!r} {verify(expected).source}\n'
-    )
-    assert (ended.returncode, ended.stderr, ended.stdout) == (0, '', told)
+def test_tools_work(tmp_path, ours):
+    calls = [
+        (
+            'sweep_gains',
+            '--grid',
+            2,
+            '--starts',
+            2,
+            '--rate',
+            10,
+            '--params-file',
+            CONFIG,
+            '-o',
+            's.png',
+        ),
+        ('sweep_gains', '--tolerance', 0),
+    ]
+    bags = (ours, REAL)
+    for number, bag in enumerate(bags):
+        damaged = shutil.copytree(bag, tmp_path / f'bag{number}')
+        (damaged / 'metadata.yaml').unlink()
+        calls += [
+            ('plot_run', bag, '-o', f'run{number}.png', '--csv', f'run{number}.csv'),
+            ('verify_run', bag),
+            ('replay_run', '--verify', bag),
+            ('recover_run', damaged),
+        ]
+    swept, refused, *ended = without_ros(*calls, cwd=tmp_path)
+    assert ((swept.code, swept.err), refused.code) == ((0, ''), 2)
+    assert (tmp_path / 's.png').stat().st_size > 10_000
+    assert [(one.code, one.err) for one in ended] == len(ended) * [(0, '')]
+    for number, bag in enumerate(bags):
+        _, verified, replayed, recovered = ended[4 * number : 4 * number + 4]
+        assert (tmp_path / f'run{number}.png').stat().st_size > 10_000
+        count = len(read_run(bag).odometry)
+        assert len((tmp_path / f'run{number}.csv').read_text().splitlines()) == 1 + count
+        assert verified.out.endswith('the robot moves as recorded\n')
+        assert replayed.out.endswith('the robot moves as recorded\n')
+        assert 'lost: ' not in recovered.out
+        assert 'not checked' not in recovered.out
+        assert len(read_run(tmp_path / f'bag{number}_recovered').odometry) == count
 
 
-def test_a_run_is_drawn_and_exported_without_ros(tmp_path, bag):
-    ended = run('plot_run', bag, '-o', tmp_path / 'run.png', '--csv', tmp_path / 'run.csv')
-    assert (ended.returncode, ended.stderr) == (0, '')
-    assert (tmp_path / 'run.png').stat().st_size > 10_000
-    lines = (tmp_path / 'run.csv').read_text().splitlines()
-    assert len(lines) == 1 + len(read_run(bag).odometry)
-
-
-@pytest.mark.parametrize('tool', [('verify_run',), ('replay_run', '--verify')])
-def test_a_run_is_verified_by_the_tools_without_ros(bag, tool):
-    ended = run(*tool, bag)
-    assert (ended.returncode, ended.stderr) == (0, '')
-    assert ended.stdout.endswith('the robot moves as recorded\n')
-
-
-def test_a_bag_is_recovered_without_ros(tmp_path, bag):
-    damaged = shutil.copytree(bag, tmp_path / 'bag')
-    (damaged / 'metadata.yaml').unlink()
-    ended = run('recover_run', damaged)
-    assert (ended.returncode, ended.stderr) == (0, '')
-    assert 'lost: ' not in ended.stdout
-    assert 'not checked' not in ended.stdout
-    assert len(read_run(tmp_path / 'bag_recovered').odometry) == len(read_run(bag).odometry)
-
-
-def test_a_journal_is_recovered_without_ros(tmp_path):
+def test_a_journal_is_recovered(tmp_path):
     """Of types that are not known the messages are saved, and reported as not checked."""
     writer = JournalWriter(tmp_path / 'run.journal.mcap')
     mine = Channel(
@@ -187,36 +159,21 @@ def test_a_journal_is_recovered_without_ros(tmp_path):
         writer.add(record)
     writer.flush()
     writer.close()
-    ended = run('recover_run', tmp_path / 'run.journal.mcap')
-    assert (ended.returncode, ended.stderr) == (0, '')
-    assert 'the 1 messages on /x were not checked' in ended.stdout
-    assert '1 of 2 messages on /odom cannot be decoded' in ended.stdout
+    (ended,) = without_ros(('recover_run', tmp_path / 'run.journal.mcap'))
+    assert (ended.code, ended.err) == (0, '')
+    assert 'the 1 messages on /x were not checked' in ended.out
+    assert '1 of 2 messages on /odom cannot be decoded' in ended.out
     assert len(read_run(tmp_path / 'run').odometry) == 1
 
 
-@pytest.mark.parametrize(
-    ('tool', 'arguments'),
-    [
-        ('drive_to', ('1', '1')),
-        ('plot_run', (BAG,)),
-        ('record_run', ('-o', 'run')),
-        ('recover_run', (BAG,)),
-        ('replay_run', (BAG,)),
-        ('verify_run', (BAG,)),
-    ],
-)
-def test_without_rosbags_one_line_reports_the_remedy(tmp_path, tool, arguments):
-    """A ROS installation has no rosbags. This package needs it in addition."""
-    ended = run(tool, *arguments, modules=('rosbags',), cwd=tmp_path)
-    assert (ended.returncode, ended.stdout) == (1, '')
-    assert ended.stderr == (
-        f'{tool}: error: there is no Python module rosbags: call pip install rosbags\n'
-    )
+def test_other_missing_modules(tmp_path):
+    """A ROS installation has no rosbags, which is needed in addition. Others are a defect."""
+    calls = [(tool, REAL) for tool in ('plot_run', 'recover_run', 'replay_run', 'verify_run')]
+    calls += [('drive_to', 1, 1), ('record_run', '-o', 'run')]
+    ended = run_each(calls, ABSENT.format(modules=('rosbags',)), modules=(), cwd=tmp_path)
+    for (tool, *_), one in zip(calls, ended, strict=True):
+        message = f'{tool}: error: there is no Python module rosbags: call pip install rosbags\n'
+        assert one == (1, '', message)
     assert not list(tmp_path.iterdir())
-
-
-def test_another_module_that_is_missing_is_a_defect_and_surfaces():
-    ended = run('drive_to', '1', '1', modules=('numpy',))
-    assert ended.returncode == 1
-    assert ended.stderr.splitlines()[-1] == "ModuleNotFoundError: No module named 'numpy'"
-    assert 'Traceback' in ended.stderr
+    with pytest.raises(AssertionError, match="ModuleNotFoundError: No module named 'numpy'"):
+        run_each([('drive_to', 1, 1)], ABSENT.format(modules=('numpy',)), modules=())
