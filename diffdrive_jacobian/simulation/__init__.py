@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian import lazy
+from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
+from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.simulation.slip import Drift
 
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.simulation.tracking import track_line
 
 __all__ = [
+    'AccelerationLimits',
+    'Actuators',
+    'AxisLimits',
     'Drift',
     'Robot',
     'RobotModel',

@@ -24,7 +24,7 @@ from diffdrive_jacobian.numerics.checks import (
     number,
     positive_or_infinite,
 )
-from diffdrive_jacobian.numerics.fields import Checked, instance
+from diffdrive_jacobian.numerics.fields import Checked, instance, short
 
 Twist = tuple[float, float]
 """`(v, omega)` (m/s, rad/s)."""
@@ -39,7 +39,7 @@ def _negative(name: str, value: object) -> float:
     try:
         return -number(name, -value, positive_or_infinite)  # type: ignore[operator]
     except (TypeError, ValueError):
-        raise ValueError(f'{name} must be negative or -inf, got {value!r:.60}') from None
+        raise ValueError(f'{name} must be negative or -inf, got {short(value, repr)}') from None
 
 
 NegativeOrInfinite = Annotated[float, _negative]

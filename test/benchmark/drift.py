@@ -30,9 +30,14 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from support.moments_reference import DRIVES, noisy_runs
 
-from diffdrive_jacobian.simulation import Drift, Robot, RobotModel
-from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation import (
+    AccelerationLimits,
+    Actuators,
+    AxisLimits,
+    Drift,
+    Robot,
+    RobotModel,
+)
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
 DRIVES = DRIVES | {

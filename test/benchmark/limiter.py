@@ -16,9 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from diffdrive_jacobian.kinematics.se2 import integrate
-from diffdrive_jacobian.simulation import Robot, RobotModel
-from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation import AccelerationLimits, Actuators, AxisLimits, Robot, RobotModel
 from diffdrive_jacobian.time_units import nanoseconds
 
 LIMITS = AccelerationLimits(

@@ -15,9 +15,13 @@ import numpy as np
 
 from diffdrive_jacobian.control import Arrival, VelocityLimits
 from diffdrive_jacobian.control.controllers import BUILT_IN
-from diffdrive_jacobian.simulation import SweepSetup, closed_loops
-from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation import (
+    AccelerationLimits,
+    Actuators,
+    AxisLimits,
+    SweepSetup,
+    closed_loops,
+)
 
 STARTS = 120
 LIMITS = VelocityLimits(min_v=-0.22, max_v=0.22, min_omega=-2.84, max_omega=2.84)

@@ -19,9 +19,14 @@ import numpy as np
 from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
 from diffdrive_jacobian.control.path_source import planned_path
-from diffdrive_jacobian.simulation import Drift, RobotModel, follow_path
-from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation import (
+    AccelerationLimits,
+    Actuators,
+    AxisLimits,
+    Drift,
+    RobotModel,
+    follow_path,
+)
 
 PAGE = File(__file__).parents[2] / 'doc' / 'mathematics.md'
 BEGIN, END = '<!-- tracking errors -->', '<!-- end of tracking errors -->'
