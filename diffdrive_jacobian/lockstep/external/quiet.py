@@ -1,9 +1,11 @@
 """When other processes have processed what they received: all their threads wait, without a break.
 
 `Quiet` looks at a process with all that it has started, and at the threads of this process that receive
-from them. It reads for how long each has run, then in which system call each thread waits, and then
-again for how long they have run. If all threads wait and nothing has run in between, then all of them
-waited when the first reading was complete, and no message was on its way from one to another.
+from them. It reads for how long each has run, then in which system call each thread waits, then whether
+it sleeps, and then again for how long they have run. If all threads sleep and nothing has run
+meanwhile, then all of them slept when the first reading was complete, and no message was on its way from one to
+another. The system call does not tell: that of a thread that was woken up, and does not run yet because
+its processor has to be told, is the one in which it waited.
 
 A thread that sleeps for a time goes on by itself, so it counts as busy. So does one that waits with a
 timeout, which is in a callback, unless it is DDS that waits, as in an idle executor, or it is a thread
@@ -56,6 +58,9 @@ PAUSE = 0.0002
 """Time between later attempts (s)."""
 LONGEST = 10
 """Largest ratio of the wall time that a process gets to the time that it is given."""
+ASLEEP = (b'S', b'I', b'Z', b'X')
+"""States of threads that wait or have ended."""
+STOPPED = (b'T', b't')
 STATES = {b'R': 'is running', b'D': 'waits for a disk', b'T': 'is stopped', b't': 'is being debugged'}
 
 
@@ -195,8 +200,11 @@ class Quiet:
             if tries == MANY_TRIES:
                 allowance = Allowance(self, patience)
             if allowance is not None and allowance.is_used_up():
-                # The cause, also if another thread is about to run.
-                any(map(self._is_stopped, self._links))
+                # What is stopped is the cause, also if another thread is about to run.
+                with suppress(ProcessLookupError):
+                    for thread in self._threads.values():
+                        if thread.state() in STOPPED:
+                            self._is_awake(thread)
                 raise LockstepError(f'not quiet within {patience:g} s: {self.describe()}')
             time.sleep(PAUSE)
 
@@ -217,7 +225,10 @@ class Quiet:
                 if self._is_busy(thread):
                     self._busy = thread
                     return False
-            return self._times() == before and not any(map(self._is_stopped, self._links))
+            # Until a thread that was woken up gets a processor it is in its system call still.
+            if any(map(self._is_awake, (*self._threads.values(), *self._own))):
+                return False
+            return self._times() == before
         except ProcessLookupError:
             # A thread has ended. The next look is at what is left.
             self._busy, self._newest = None, b''
@@ -239,13 +250,16 @@ class Quiet:
         except OSError:
             raise ProcessLookupError from None
 
-    def _is_stopped(self, pid: int) -> bool:
-        """Return whether a process is stopped or debugged, in whatever system call that is."""
-        thread = self._threads[pid, pid]
+    def _is_awake(self, thread: _Thread) -> bool:
+        """Return whether a thread does not sleep, by its state, whatever its system call is.
+
+        Raises:
+            ProcessLookupError: It has ended.
+        """
         state = thread.state()
-        if state not in (b'T', b't'):
+        if state in ASLEEP:
             return False
-        self._busy, self._why = thread, STATES[state]
+        self._busy, self._why = thread, STATES.get(state, f'has the state {state.decode()}')
         return True
 
     def _is_busy(self, thread: _Thread) -> bool:
