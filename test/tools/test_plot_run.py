@@ -103,6 +103,7 @@ def drawn(axes, color=_figure.COLORS[0]):
 # --- Files
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures('no_display')
 def test_the_picture_lies_beside_a_bag_of_any_name(folder, monkeypatch):
     name = '_$x^$ 走行' + 'a' * 200
@@ -112,6 +113,7 @@ def test_the_picture_lies_beside_a_bag_of_any_name(folder, monkeypatch):
     assert picture.read_bytes().startswith(b'\x89PNG')
 
 
+@pytest.mark.slow
 def test_the_picture_is_of_the_format_of_its_ending(bag, folder):
     assert plot(bag, '-o', 'picture.SVG') == (0, 'picture.SVG\n', '')
     assert (folder / 'picture.SVG').read_bytes().startswith(b'<?xml')
@@ -163,6 +165,7 @@ def test_the_axes_show_the_run_with_units(run):
     assert shown[:, 1] == pytest.approx(error[:until], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_everything_drawn_lies_inside_the_picture(run):
     made = figure([run, replace(run, path=Path('second'))])
     render(made, 'png')
@@ -243,11 +246,9 @@ def test_a_limit_holds_from_when_it_was_set(tmp_path):
 
 
 CONTROLLER = {'controller': 'go_to_goal', 'use_goal_heading': False, 'xy_goal_tolerance': 0.05}
-WAY = goals(goal(0.5, 0.3), goal(1.0, 0))
-
-
 TOPICS = {'PoseStamped': '/goal_pose', 'GoalStatus': '/goal_status', 'Goals': '/goals'}
 FAR, OTHER = goal(5, 0), goal(7, 0)
+WAY = goals(goal(0.5, 0.3), goal(1.0, 0))
 COUNTING = {
     'from when it came until the next': (
         [(11.0, FAR), (12.0, OTHER)],

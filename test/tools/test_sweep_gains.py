@@ -267,6 +267,7 @@ def test_plain_it_writes_a_picture_and_the_numbers_and_overwrites_nothing(folder
     assert left(folder) == sorted([*taken, *made])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures('no_display')
 def test_what_is_named_is_what_is_written_without_a_display(folder):
     assert run(*QUICK, '-o', 'a.PNG').out.startswith('a.PNG\nfastest: ')
