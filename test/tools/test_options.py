@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
+import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
+from geometry_msgs.msg import Twist
+from rclpy.parameter import Parameter
 from support.commands import refused, run
+from support.lockstep_nodes import make_complete
+from support.recorded import LockstepRecording
+from support.ros_messages import twist
 
+from diffdrive_jacobian.bags import BagError, read_run
+from diffdrive_jacobian.bags.bag_reader import open_bag
+from diffdrive_jacobian.bags.bag_writer import build_bag
+from diffdrive_jacobian.bags.journal import Text
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.goal_client import GoalClient
+from diffdrive_jacobian.nodes.remote_goal import _Session
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.parameters import configurations as configuration_files
 from diffdrive_jacobian.parameters.configurations import configurations
+from diffdrive_jacobian.recording import NothingToPlayError, Playback, replay
+from diffdrive_jacobian.recording.record import open_recording
+from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _messages
+from diffdrive_jacobian.testing import Lockstep
+from diffdrive_jacobian.tools import _messages, plot_run
 
 CONFIGS = Path(__file__).parents[2] / 'config'
 
@@ -26,24 +47,22 @@ def test_the_configurations_of_the_clone_are_found():
 
 
 def test_the_configurations_of_an_installation_are_found(tmp_path, monkeypatch):
-    from diffdrive_jacobian.parameters import configurations as module
-
     folder = tmp_path / 'share' / 'diffdrive_jacobian' / 'config'
     folder.mkdir(parents=True)
     (folder / 'rover.yaml').write_text('')
     # As if the package was not in a clone.
-    monkeypatch.setattr(module, '__file__', str(tmp_path / 'lib' / 'a' / 'b' / 'c.py'))
+    monkeypatch.setattr(configuration_files, '__file__', str(tmp_path / 'lib' / 'a' / 'b' / 'c.py'))
     monkeypatch.setenv('AMENT_PREFIX_PATH', '/nowhere')
     assert 'rover' not in configurations()
     monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(['/nowhere', str(tmp_path)]))
     assert configurations()['rover'] == folder / 'rover.yaml'
     monkeypatch.delenv('AMENT_PREFIX_PATH')
-    monkeypatch.setattr(module, '__file__', str(tmp_path / 'a' / 'b' / 'c.py'))
+    monkeypatch.setattr(configuration_files, '__file__', str(tmp_path / 'a' / 'b' / 'c.py'))
     assert configurations()['rover'] == folder / 'rover.yaml'
     # As pip and colcon install. The list of the installed files, which is slow to read, is not needed.
     site = tmp_path / 'lib' / 'python3' / 'site-packages'
-    monkeypatch.setattr(module, '__file__', str(site / 'a' / 'b' / 'c.py'))
-    monkeypatch.setattr(module, '_listed_files', lambda: pytest.fail('it reads the list'))
+    monkeypatch.setattr(configuration_files, '__file__', str(site / 'a' / 'b' / 'c.py'))
+    monkeypatch.setattr(configuration_files, '_listed_files', lambda: pytest.fail('it reads the list'))
     assert configurations() == {'rover': folder / 'rover.yaml'}
 
 
@@ -53,14 +72,6 @@ def test_the_configurations_of_an_installation_are_found(tmp_path, monkeypatch):
 @pytest.fixture(scope='module')
 def robots(tmp_path_factory):
     """A bag of two robots with different limits; the second one stands elsewhere."""
-    from geometry_msgs.msg import Twist
-    from support.lockstep_nodes import make_complete
-    from support.recorded import LockstepRecording
-    from support.ros_messages import twist
-
-    from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-    from diffdrive_jacobian.testing import Lockstep
-
     path = tmp_path_factory.mktemp('bags') / 'two'
     with Lockstep() as world:
         world.add(make_complete(VirtualRobot, 'one'))
@@ -79,8 +90,6 @@ def robots(tmp_path_factory):
 
 
 def test_a_bag_of_several_robots_is_read_by_namespace(robots):
-    from diffdrive_jacobian.bags import BagError, read_run
-
     with pytest.raises(BagError, match='choose one of them, or one namespace'):
         read_run(robots)
     first, second = (read_run(robots, namespace=name) for name in ('/one', '/two'))
@@ -100,16 +109,12 @@ def test_verify_run_verifies_each_of_several_robots(robots):
             ended = run(*tool, robots, '--namespace', name)
             assert (ended.code, 'moves as recorded' in ended.out) == (0, True)
     assert 'one namespace (--namespace)' in refused('verify_run', robots)
-
-
-def test_parameters_that_a_verification_does_not_use_are_refused(robots):
-    arguments = (robots, '--namespace', 'one', '--robot', 'create3')
-    assert 'have no effect: the bag has cmd_vel_out' in refused('verify_run', *arguments)
+    # Parameters that it does not use are refused.
+    message = refused('verify_run', robots, '--namespace', 'one', '--robot', 'create3')
+    assert 'have no effect: the bag has cmd_vel_out' in message
 
 
 def test_plot_run_writes_one_of_several_robots(robots, monkeypatch):
-    from diffdrive_jacobian.tools import plot_run
-
     drawn = []
     monkeypatch.setattr(plot_run, 'draw', lambda runs, path, **_: drawn.append((runs[0], path)))
     assert run('plot_run', robots, '--namespace', 'two').code == 0
@@ -118,9 +123,6 @@ def test_plot_run_writes_one_of_several_robots(robots, monkeypatch):
 
 
 def test_playback_chooses_a_namespace(robots):
-    from diffdrive_jacobian.bags.bag_reader import BagError, open_bag
-    from diffdrive_jacobian.recording import NothingToPlayError, Playback
-
     def topics(**how):
         with open_bag(robots) as reader:
             return {one.topic for one in Playback(**how).choose(reader)}
@@ -145,9 +147,6 @@ def test_playback_chooses_a_namespace(robots):
 
 
 def test_a_bag_replaces_another_one_only_if_asked(robots, tmp_path):
-    from diffdrive_jacobian.bags.bag_writer import build_bag
-    from diffdrive_jacobian.bags.journal import Text
-
     target = tmp_path / 'run'
     build_bag([], [Text('a', 'old')], target, 'mcap')
     with pytest.raises(FileExistsError, match='exists already'):
@@ -171,8 +170,6 @@ def test_a_bag_replaces_another_one_only_if_asked(robots, tmp_path):
     'content', [(), ('notes.txt',), ('metadata.yaml', 'thesis.tex'), ('other.journal.mcap',)]
 )
 def test_a_directory_that_is_no_bag_is_never_replaced(tmp_path, content):
-    from diffdrive_jacobian.recording.record import open_recording
-
     target = tmp_path / 'thesis'
     target.mkdir()
     for name in content:
@@ -198,36 +195,33 @@ def undrawn(monkeypatch):
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_drive_to_replaces_bag_and_picture(tmp_path, monkeypatch):
-    from diffdrive_jacobian.bags import read_run
-
+def test_force_replaces_bags_and_files_and_no_directories(tmp_path, robots, monkeypatch):
     pytest.importorskip('matplotlib')
     monkeypatch.chdir(tmp_path)
-    arguments = ('--lockstep', '-o', 'run', '--tolerance', '0.05')
-    assert run('drive_to', '0.1', '0', *arguments, '--no-plot').code == 0
-    (tmp_path / 'run.png').write_text('old')
-    assert 'run exists already' in refused('drive_to', '0.2', '0', *arguments)
-    assert run('drive_to', '0.2', '0', *arguments, '--force').code == 0
-    assert read_run(tmp_path / 'run').goals.values[0, 0] == 0.2
-    assert (tmp_path / 'run.png').read_bytes() == b'picture'
-    assert sorted(one.name for one in tmp_path.iterdir()) == ['run', 'run.png']
-
-
-@pytest.mark.usefixtures('undrawn')
-def test_plot_run_and_sweep_gains_overwrite_files_only(tmp_path, robots, monkeypatch):
-    pytest.importorskip('matplotlib')
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / 'a.png').write_text('old')
-    (tmp_path / 'a.csv').write_text('old')
+    for name in ('run.png', 'a.png', 'a.csv'):
+        (tmp_path / name).write_text('old')
     (tmp_path / 'b.png').mkdir()
+    build_bag([], [Text('a', 'old')], tmp_path / 'run', 'mcap')
     plot = ('plot_run', robots, '--namespace', 'one', '-o')
-    sweep = ('sweep_gains', '--grid', 2, '--starts', 1, '--duration', 1, '--csv')
-    for command in ((*plot, 'a.png'), (*sweep, 'a.csv')):
-        assert '--force overwrites files' in refused(*command)
+    sweep = ('sweep_gains', '--grid', 2, '--starts', 1, '--duration', 1, '--csv', 'a.csv')
+    for command in (
+        ('drive_to', 0.2, 0, '--lockstep', '-o', 'run', '--tolerance', 0.05),
+        (*plot, 'a.png'),
+        sweep,
+    ):
         assert run(*command, '--force').code == 0
-    assert (tmp_path / 'a.png').read_bytes() == b'picture'
+    assert read_run(tmp_path / 'run').goals.values[0, 0] == 0.2
+    for name in ('run.png', 'a.png'):
+        assert (tmp_path / name).read_bytes() == b'picture'
     assert (tmp_path / 'a.csv').read_text().startswith('kp_per_s')
     assert run(*plot, 'b.png', '--force').code == 2
+    assert sorted(one.name for one in tmp_path.iterdir()) == [
+        'a.csv',
+        'a.png',
+        'b.png',
+        'run',
+        'run.png',
+    ]
 
 
 # --- Waiting
@@ -249,21 +243,13 @@ def test_what_is_waited_for_is_said_after_half_a_second_of_each_wait(monkeypatch
         if capsys.readouterr().out:
             said.append(step)
     assert said == pytest.approx([5, 35, 65, 95], abs=1)
-    now += 5.0
-    waiting.show('the end')
-    assert capsys.readouterr().out == ''
-    now += 0.3
-    waiting.show('the end')
-    assert capsys.readouterr().out == ''
-    now += 0.3
-    waiting.show('the end')
-    assert capsys.readouterr().out == 'waiting: the end\n'
+    for later, line in ((5.0, ''), (5.3, ''), (5.6, 'waiting: the end\n')):
+        now = 109.9 + later
+        waiting.show('the end')
+        assert capsys.readouterr().out == line
 
 
 def test_long_work_is_named_on_a_terminal(monkeypatch, capsys):
-    import io
-    import threading
-
     class Terminal(io.StringIO):
         written = threading.Event()
 
@@ -288,11 +274,10 @@ def test_long_work_is_named_on_a_terminal(monkeypatch, capsys):
 
 
 class Progress:
-    """A progress that keeps what it is told."""
+    """A progress that keeps what it is told of the controller and of what is waited for."""
 
     def __init__(self):
-        self.ignored = []
-        self.reasons = set()
+        self.ignored, self.reasons = [], set()
 
     def heading_ignored(self, controller):
         self.ignored.append(controller)
@@ -300,14 +285,13 @@ class Progress:
     def waiting(self, reason):
         self.reasons.add(reason)
 
-    def driving(self, distance):
+    def toggled(self):
+        return False
+
+    def nothing(self, *_, **__):
         pass
 
-    def no_odometry(self, topic, seconds):
-        pass
-
-    def standing(self, seconds):
-        pass
+    driving = no_odometry = standing = started = playing = ended = nothing
 
 
 @pytest.mark.parametrize(
@@ -321,14 +305,6 @@ class Progress:
     ],
 )
 def test_a_controller_that_ignores_the_heading_is_reported(follow, matters, parameters, expected):
-    import numpy as np
-    from rclpy.parameter import Parameter
-
-    from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-    from diffdrive_jacobian.nodes.goal_client import GoalClient
-    from diffdrive_jacobian.nodes.remote_goal import _Session
-    from diffdrive_jacobian.ros.runner import ros_context, running
-
     overrides = [Parameter(name, value=value) for name, value in parameters.items()]
     progress, signals = Progress(), Signals()
     with ros_context(['test']) as context, running(context, isolated=True) as runner:
@@ -343,22 +319,7 @@ def test_a_controller_that_ignores_the_heading_is_reported(follow, matters, para
 
 
 def test_a_replay_says_which_subscriptions_it_waits_for(robots, capfd):
-    from diffdrive_jacobian.recording import Playback, replay
-
-    class Reasons(Progress):
-        def started(self, seconds):
-            pass
-
-        def playing(self, seconds, *, paused):
-            pass
-
-        def toggled(self):
-            return False
-
-        def ended(self):
-            pass
-
-    progress = Reasons()
+    progress = Progress()
     playback = Playback(namespace='/one', rate=100.0)
     assert replay(robots, playback, patience=0.1, progress=progress).played
     assert progress.reasons == {
