@@ -59,7 +59,7 @@ class Served:
             self.publisher.publish(serialize_message(String(data=str(word))))
 
     def spin(self, until):
-        """Execute callbacks until a condition holds; return on which executors that was (fair or not)."""
+        """Execute callbacks until a condition holds; return the values of `fair` meanwhile."""
         deadline, fair = time.monotonic() + PATIENCE, set()
         while not until():
             assert time.monotonic() < deadline
