@@ -119,6 +119,7 @@ def on_either(served, request):
 # --- When nodes move
 
 
+@pytest.mark.slow
 def test_floods_move_the_nodes_for_longer_and_longer_and_are_logged_once(monkeypatch, served, capfd):
     monkeypatch.setattr(guarded_executor, 'FIRST_HOLD', 0.05)
     monkeypatch.setattr(guarded_executor, 'WINDOW', 0.05)
