@@ -106,7 +106,8 @@ def test_a_goal_is_driven_to_and_every_number_of_the_chain_is_there(driven):
     driven.send(goal(0.4, 0.3))
     driven.until(lambda: driven.state() == 'executing' and driven.robot()['commanded'])
     robot = driven.robot()
-    assert robot['goal']['goals'][0][:2] == [0.4, 0.3]
+    # Without a heading it is approached straight.
+    assert robot['goal']['goals'][0] == pytest.approx([0.4, 0.3, math.atan2(0.3, 0.4)], abs=1e-5)
     assert robot['distance'] == pytest.approx(0.5, abs=0.02)
     assert robot['law']['name'] == 'go_to_goal'
     assert robot['law']['gains']['Kp'] == QUICK['kp']
@@ -118,59 +119,44 @@ def test_a_goal_is_driven_to_and_every_number_of_the_chain_is_there(driven):
     world = np.array(chain['unicycle']) @ chain['twist']
     assert world == pytest.approx(np.array(chain['world']), rel=1e-4, abs=1e-6)
     driven.until(lambda: driven.state() == 'succeeded')
-    x, y, _ = driven.robot()['pose']
-    assert math.dist((x, y), (0.4, 0.3)) <= 0.02
-    assert driven.robot()['region']['a'] > driven.robot()['region']['b'] > 0.0
+    robot = driven.robot()
+    assert robot['distance'] == pytest.approx(math.dist(robot['pose'][:2], (0.4, 0.3)), abs=1e-5)
+    assert robot['distance'] <= 0.02
+    assert robot['bearing_error'] is None
+    assert robot['region']['a'] > robot['region']['b'] > 0.0
     _, snapshot = driven.session.latest()
     assert len(snapshot.trails['/'].points) > 10
 
 
-def test_waypoints_are_appended_and_a_goal_is_canceled(driven):
-    driven.send(goal(0.3, 0.0))
+def test_waypoints_are_appended_and_the_ends_of_goals_are_reported(driven):
+    ends = []
+    driven.node.robots['/'].on_end = ends.append
+    # To a goal that was sent just now.
+    driven.send(goal(0.2, 0.0), goal(0.2, 0.2, append=True))
     driven.until(lambda: driven.state() == 'executing')
-    driven.send(goal(0.3, 0.3, append=True), goal(5.0, 5.0, 1.0, append=True))
-    driven.until(lambda: len(driven.robot()['goal']['goals']) > 1)
-    driven.until(lambda: driven.robot()['goal']['index'] == len(driven.robot()['goal']['goals']) - 1)
-    assert driven.robot()['goal']['goals'][-1] == [5.0, 5.0, 1.0]
+    assert [one[:2] for one in driven.robot()['goal']['goals']] == [[0.2, 0.0], [0.2, 0.2]]
+    # To an active goal.
+    driven.send(goal(0.0, 0.2, 1.0, append=True))
+    driven.until(lambda: driven.robot()['goal']['goals'][-1] == [0.0, 0.2, 1.0])
+    goals = driven.robot()['goal']['goals']
+    assert len(goals) > 1
+    driven.until(lambda: driven.robot()['goal']['index'] == len(goals) - 1)
+    driven.until(lambda: driven.state() == 'succeeded')
+    # To none.
+    driven.send(goal(5.0, 5.0, append=True))
+    driven.until(lambda: driven.state() == 'executing')
+    assert len(driven.robot()['goal']['goals']) == 1
     driven.send(CancelGoal('/'))
     driven.until(lambda: driven.state() == 'canceled')
     driven.pass_time(0.1)
     assert driven.robot()['twist'] == [0.0, 0.0]
     driven.send(CancelGoal('/'))
     driven.until(lambda: any('no goal is active' in text for text in driven.texts))
-
-
-def test_the_ends_of_goals_are_reported_with_the_place_of_the_robot(driven):
-    ends = []
-    driven.node.robots['/'].on_end = ends.append
-    driven.send(goal(0.2, 0.0), goal(0.3, 0.1, append=True))
-    driven.until(lambda: driven.state() == 'succeeded')
-    driven.send(goal(5.0, 5.0))
-    driven.until(lambda: driven.state() == 'executing')
-    driven.send(CancelGoal('/'))
-    driven.until(lambda: driven.state() == 'canceled')
     assert [(end.robot, end.state.name) for end in ends] == [('/', 'SUCCEEDED'), ('/', 'CANCELED')]
-    np.testing.assert_array_equal([end.goal[:2] for end in ends], [[0.3, 0.1], [5.0, 5.0]])
+    np.testing.assert_array_equal([end.goal[:2] for end in ends], [[0.0, 0.2], [5.0, 5.0]])
     for end in ends:
         assert end.distance == pytest.approx(math.dist(end.pose[:2], end.goal[:2]))
     assert ends[0].distance <= 0.021
-
-
-def test_a_waypoint_is_appended_to_a_goal_that_was_sent_just_now(driven):
-    driven.send(goal(0.3, 0.0), goal(0.3, 0.3, append=True), goal(0.0, 0.3, append=True))
-    driven.until(lambda: driven.state() == 'executing')
-    places = [one[:2] for one in driven.robot()['goal']['goals']]
-    assert places == [[0.3, 0.0], [0.3, 0.3], [0.0, 0.3]]
-    driven.until(lambda: driven.state() == 'succeeded')
-    driven.send(goal(0.5, 0.5, append=True))
-    driven.until(lambda: driven.state() == 'executing')
-    assert len(driven.robot()['goal']['goals']) == 1
-
-
-def test_without_a_heading_the_goal_is_approached_straight(driven):
-    driven.send(goal(0.3, 0.3))
-    driven.until(lambda: driven.robot()['goal']['goals'])
-    assert driven.robot()['goal']['goals'][0][2] == pytest.approx(math.pi / 4, abs=1e-5)
 
 
 def test_driving_by_hand_cancels_the_goal_first_and_stops_with_the_page(driven):
@@ -199,11 +185,11 @@ def test_driving_by_hand_sends_25_commands_per_second_however_often_the_page_is_
     commands = driven.world.listen(Twist, 'cmd_vel')
     driven.send(DriveByHand('/', 0.25, 0.5))
     begin = driven.world.elapsed
-    while driven.world.elapsed < begin + 1.0:
+    while driven.world.elapsed < begin + 0.4:
         for _ in range(5):
             driven.node.work()
         driven.world.step(0.01)
-    assert 20 <= len(commands) <= 26
+    assert 8 <= len(commands) <= 11
 
 
 def test_a_goal_is_refused_while_the_robot_is_driven_by_hand(driven):
@@ -433,33 +419,17 @@ def test_a_robot_that_slips_is_shown_where_it_truly_is(live):
     assert len(live.session.latest()[1].true_trails['/'].points) <= 1
 
 
-def test_the_error_of_the_heading_is_shown_where_it_counts(driven):
-    driven.send(goal(0.3, 0.0, 2.0))
+def test_the_heading_of_a_goal_is_shown_where_it_counts(driven):
+    driven.send(goal(0.3, 0.0), goal(0.3, 0.1, 2.0))
     driven.until(lambda: driven.state() == 'executing')
     assert driven.robot()['goal_heading_error'] is None
-    driven.send(SetParameter('/', 'controller/use_goal_heading', value=True))
-    driven.until(lambda: driven.robot()['use_heading'])
-    shown = driven.robot()
-    assert shown['goal_heading_error'] == pytest.approx(2.0 - shown['pose'][2], abs=1e-4)
-    assert driven.robot()['truth'] is None
-
-
-def test_a_heading_that_does_not_count_is_told(driven):
-    driven.send(goal(0.3, 0.0), goal(0.3, 0.1, 2.0))
-    driven.pass_time(0.1)
     (text,) = driven.texts
     assert text.startswith('go_to_goal ignores the heading of the goal')
     driven.send(SetParameter('/', 'controller/use_goal_heading', value=True))
     driven.until(lambda: driven.robot()['use_heading'])
+    shown = driven.robot()
+    assert shown['goal_heading_error'] == pytest.approx(2.0 - shown['pose'][2], abs=1e-4)
+    assert shown['truth'] is None
     driven.send(goal(0.3, 0.2, 2.0))
     driven.pass_time(0.1)
     assert driven.texts == [text]
-
-
-def test_the_distance_from_a_goal_is_shown_after_the_arrival(driven):
-    driven.send(goal(0.3, 0.0))
-    driven.until(lambda: driven.state() == 'succeeded')
-    shown = driven.robot()
-    x, y, _ = shown['pose']
-    assert shown['distance'] == pytest.approx(math.hypot(0.3 - x, y), abs=1e-5)
-    assert shown['bearing_error'] is None

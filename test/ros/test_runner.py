@@ -14,34 +14,27 @@ from diffdrive_jacobian.lockstep.runner import running_in_lockstep
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros.guarded_executor import GuardedExecutor
 from diffdrive_jacobian.ros.runner import UserError, make_executor, ros_context, running
 from diffdrive_jacobian.signals import Signals
 
 
-def test_isolated_nodes_have_the_events_executor_and_others_the_guarded_one(ros):
-    open_to_all = make_executor(ros.context, isolated=False)
-    assert isinstance(open_to_all, GuardedExecutor)
-    open_to_all.shutdown()
-    closed = make_executor(ros.context, isolated=True)
-    assert type(closed).__name__ == 'EventsExecutor'
-    closed.shutdown()
-
-
-def test_callbacks_with_message_info_have_the_single_threaded_executor(ros):
-    executor = make_executor(ros.context, isolated=False, with_info=True)
-    assert isinstance(executor, SingleThreadedExecutor)
+@pytest.fixture
+def executor(ros, request):
+    executor = make_executor(ros.context, **request.param)
+    yield executor
     executor.shutdown()
 
 
-@pytest.mark.parametrize('node_class', [VirtualRobot, GoToGoal, WheelBridge])
-def test_nodes_of_this_package_run_on_events(ros, node_class):
-    executor = make_executor(ros.context, isolated=False)
-    node = node_class(context=ros.context)
-    executor.add_node(node)
-    assert not executor.fair
-    executor.shutdown()
-    node.destroy_node()
+OPEN, ISOLATED = {'isolated': False}, {'isolated': True}
+CASES = [
+    *((OPEN, 'GuardedExecutor'), (ISOLATED, 'EventsExecutor')),
+    ({**OPEN, 'with_info': True}, 'SingleThreadedExecutor'),
+]
+
+
+@pytest.mark.parametrize(('executor', 'kind'), CASES, indirect=['executor'])
+def test_kind_of_executor(executor, kind):
+    assert type(executor).__name__ == kind
 
 
 @pytest.mark.parametrize('isolated', [False, True])
@@ -50,6 +43,17 @@ def test_without_the_events_executor_all_have_the_single_threaded_one(ros, monke
     executor = make_executor(ros.context, isolated=isolated)
     assert isinstance(executor, SingleThreadedExecutor)
     executor.shutdown()
+
+
+@pytest.mark.parametrize('executor', [OPEN], indirect=True)
+def test_nodes_of_this_package_run_on_events(ros, executor):
+    nodes = [create(context=ros.context) for create in (VirtualRobot, GoToGoal, WheelBridge)]
+    for node in nodes:
+        executor.add_node(node)
+        assert not executor.fair
+    executor.shutdown()
+    for node in nodes:
+        node.destroy_node()
 
 
 @pytest.mark.parametrize('isolated', [False, True])
@@ -115,92 +119,55 @@ def test_every_node_is_stopped_before_any_is_destroyed():
         assert told == [('shutting down', True, 2)]
 
 
-def test_mistakes_of_the_user_are_named():
+def start_robot(*arguments):
+    """Start and stop a robot with ROS arguments."""
     with (
-        pytest.raises(UserError, match=r"'wheel_radius' must be in \[0.001, 10\], got 0.0"),
-        ros_context(['test', '--ros-args', '-p', 'wheel_radius:=0.0']) as context,
+        ros_context(['test', '--ros-args', *arguments]) as context,
         running(context, isolated=True) as runner,
     ):
         runner.add(lambda: VirtualRobot(context=context))
-    with (
-        pytest.raises(UserError, match=r"ROS arguments: .*'--bogus'"),
-        ros_context(['test', '--ros-args', '--bogus']),
-    ):
-        pass
 
 
-@pytest.mark.parametrize(
-    ('flag', 'rule', 'message'),
-    [
-        ('-p', 'kp=2', "-p must be NAME:=VALUE, got 'kp=2'; did you mean 'kp:=2'?"),
-        ('--param', 'kp', "--param must be NAME:=VALUE, got 'kp'"),
-        ('-r', 'a=b', "-r must be OLD:=NEW, got 'a=b'; did you mean 'a:=b'?"),
-        (
-            '-r',
-            '__ns:=robot1',
-            "a namespace must begin with a slash, got '__ns:=robot1'; did you mean '__ns:=/robot1'?",
-        ),
-    ],
-)
-def test_rules_of_ros_arguments_get_a_hint(flag, rule, message):
-    with pytest.raises(UserError) as caught, ros_context(['test', '--ros-args', flag, rule]):
-        pass
-    assert str(caught.value) == f'ROS arguments: {message}'
-
-
-LONG = {
-    'topic': (('-r', f'odom:={248 * "t"}'), 'with its leading slash, got 249'),
-    'absolute topic': (('--remap', f'odom:=/{247 * "t"}'), 'with its leading slash, got 248'),
-    'node': (('-r', f'__node:={300 * "n"}'), 'at most 247 characters with its leading slash, got 301'),
-    'namespace': (('-r', f'__ns:=/{247 * "n"}'), 'with its leading slash, got 248'),
-    'service': (
-        ('-r', f'reset_odometry:={255 * "s"}'),
-        'at most 247 characters with its leading slash, got 256',
+INVALID = {
+    'parameter': (('-p', 'wheel_radius:=0.0'), "'wheel_radius' must be in [0.001, 10], got 0.0"),
+    'unknown': (('--bogus',), "unknown ROS arguments: ['--bogus']"),
+    'equals sign': (('-p', 'kp=2'), "-p must be NAME:=VALUE, got 'kp=2'; did you mean 'kp:=2'?"),
+    'no value': (('--param', 'kp'), "--param must be NAME:=VALUE, got 'kp'"),
+    'remap': (('-r', 'a=b'), "-r must be OLD:=NEW, got 'a=b'; did you mean 'a:=b'?"),
+    'relative namespace': (
+        ('-r', '__ns:=robot1'),
+        "must begin with a slash, got '__ns:=robot1'; did you mean '__ns:=/robot1'?",
     ),
-    'of one node': (('-r', f'virtual_robot:odom:={300 * "t"}'), "'virtual_robot:odom:=tttt"),
+    'long topic': (
+        ('-r', f'odom:={247 * "t"}'),
+        'at most 247 characters with its leading slash, got 248',
+    ),
+    'long absolute topic': (('--remap', f'odom:=/{247 * "t"}'), 'got 248'),
+    'long name of a node': (('-r', f'__node:={300 * "n"}'), 'got 301'),
+    'long topic of one node': (('-r', f'virtual_robot:odom:={300 * "t"}'), "'virtual_robot:odom:=tttt"),
     # Each of these is short enough by itself.
-    'node and its services': (('-r', f'__node:={240 * "n"}'), 'Invalid service name: topic length'),
-    'namespace and topic': (('-r', f'__ns:=/{240 * "n"}'), 'should not exceed'),
-    'namespace and service': (
+    'long services of a node': (('-r', f'__node:={240 * "n"}'), 'Invalid service name: topic length'),
+    'long topics of a namespace': (('-r', f'__ns:=/{240 * "n"}'), 'should not exceed'),
+    'long together': (
         ('-r', f'__ns:=/{120 * "n"}', '-r', f'reset_odometry:={130 * "s"}'),
-        'topic length should not exceed',
-    ),
-    'namespace and topic, both given': (
-        ('-r', f'__ns:=/{120 * "n"}', '-r', f'odom:={130 * "t"}'),
         'topic length should not exceed',
     ),
 }
 
 
-@pytest.mark.parametrize(('arguments', 'words'), LONG.values(), ids=LONG)
-def test_names_that_are_too_long_are_mistakes_of_the_user(arguments, words):
-    with (
-        pytest.raises(UserError) as caught,
-        ros_context(['test', '--ros-args', *arguments]) as context,
-        running(context, isolated=True) as runner,
-    ):
-        runner.add(lambda: VirtualRobot(context=context))
+@pytest.mark.parametrize(('arguments', 'words'), INVALID.values(), ids=INVALID)
+def test_mistakes_of_the_user_are_described_in_one_line(arguments, words):
+    with pytest.raises(UserError) as caught:
+        start_robot(*arguments)
     message = str(caught.value)
     assert words in message
     assert len(message) < 300
     assert '\n' not in message
 
 
-@pytest.mark.parametrize(
-    'arguments',
-    [
-        ('-r', f'odom:={246 * "t"}'),
-        ('-r', f'odom:=/{246 * "t"}'),
-        ('-r', f'reset_odometry:={245 * "s"}'),
-        ('-r', f'__node:={200 * "n"}'),
-    ],
-)
-def test_names_of_the_greatest_length_are_accepted(arguments):
-    with (
-        ros_context(['test', '--ros-args', *arguments]) as context,
-        running(context, isolated=True) as runner,
-    ):
-        runner.add(lambda: VirtualRobot(context=context))
+def test_names_of_the_greatest_length_are_accepted():
+    start_robot('-r', f'odom:={246 * "t"}', '-r', f'reset_odometry:={245 * "s"}')
+    start_robot('-r', f'odom:=/{246 * "t"}', '-r', f'__node:={200 * "n"}')
 
 
 @pytest.mark.parametrize('domain', ['233', '-1', 'home', '٣'])
