@@ -80,7 +80,7 @@ def _drive(seconds: float, *prefix: str) -> str:
 
 def rows(quick: bool) -> list[Row]:
     """Count the different results."""
-    seconds, (alone, parallel, loaded) = (3.0, (1, 2, 1)) if quick else (60.0, (5, 5, 10))
+    seconds, (alone, parallel, loaded) = (1.0, (1, 1, 1)) if quick else (60.0, (5, 5, 10))
     results = [_drive(seconds) for _ in range(alone)]
     with ThreadPoolExecutor(parallel) as pool:
         results += pool.map(_drive, [seconds] * parallel)

@@ -106,7 +106,7 @@ def _check(commands: int, seconds: float) -> None:
 
 def rows(quick: bool) -> list[Row]:
     """Measure all sides in turn."""
-    seconds, rounds = (10.0, 2) if quick else (60.0, 9)
+    seconds, rounds = (3.0, 1) if quick else (60.0, 9)
     figures = interleave(
         ('prototype', *SIDES),
         rounds,

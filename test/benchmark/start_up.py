@@ -120,7 +120,7 @@ def rows(quick: bool) -> list[Row]:
         interpreters = dict(zip(INSTALLATIONS, (sys.executable, interpreter), strict=True))
         sides = [(where, script) for where in INSTALLATIONS for script in (ours, bare.name)]
         figures = interleave(
-            sides, 3 if quick else 15, lambda side: start(interpreters[side[0]], side[1])
+            sides, 1 if quick else 15, lambda side: start(interpreters[side[0]], side[1])
         )
         return [
             Row(

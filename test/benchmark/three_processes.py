@@ -104,7 +104,7 @@ def _cpu_time(pid: int) -> float:
 
 def rows(quick: bool) -> list[Row]:
     """Measure the three sides in turn."""
-    seconds, rounds = (4.0, 1) if quick else (15.0, 7)
+    seconds, rounds = (2.0, 1) if quick else (15.0, 7)
     figures = interleave(
         ('our', 'quiet', 'bare'),
         rounds,

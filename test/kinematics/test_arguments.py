@@ -35,6 +35,7 @@ ELSEWHERE = {
     *('Boundary', 'Controller', 'ControllerError', 'Controllers', 'Gain', 'LawError'),
     *('controller_names', 'find_controller', 'KP', 'KV', 'OFFSET', 'CUTOFF', 'FILTER', 'Ellipsoid'),
     *('Sweep', 'SweepSetup', 'describe_sweep', 'sweep', 'sweep_table'),
+    *('AccelerationLimits', 'Actuators', 'AxisLimits'),
 }
 """Public names that are no functions of numbers, or tested in files of their own."""
 OPTIONAL = {'h', 'arrival', 'progress', 'commanded_at', 'seed', 'drift', 'threshold', 'q_dot_0'}
