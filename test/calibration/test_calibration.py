@@ -156,9 +156,9 @@ def test_umbmark_recovers_the_true_multipliers(given):
 
 @pytest.mark.slow
 def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance():
-    """A small form of `benchmark/calibration_cases.py`: mean squares of 8 robots."""
+    """A small form of `benchmark/calibration_cases.py`: mean squares of 16 robots."""
     errors, nees, bounds, places = [], [], [], []
-    count = 8
+    count = 16
     for seed in range(count):
         random = np.random.default_rng(100 + seed)
         result = calibrate([ROBOT.recording(random)], NOMINAL)
@@ -180,7 +180,7 @@ def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance()
         )
         bounds.append(np.diag(np.linalg.inv(information([motion], NOMINAL, known)))[:3])
     ratio = np.mean(np.square(errors) / np.array(TRUE) ** 2 / bounds, axis=0)
-    # The mean of squares of 8 numbers of variance 1 has the deviation sqrt(2 / 8).
+    # The mean of squares of 16 numbers of variance 1 has the deviation sqrt(2 / 16).
     assert (np.abs(ratio - 1.0) < 3.5 * np.sqrt(2.0 / count)).all(), ratio
     assert abs(np.mean(nees) - 3.0) < 3.5 * np.sqrt(6.0 / count)
     assert (np.abs(np.mean(np.square(places), axis=0) - 1.0) < 3.5 * np.sqrt(2.0 / count)).all(), places
