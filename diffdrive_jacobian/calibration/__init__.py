@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from diffdrive_jacobian import lazy
 from diffdrive_jacobian.calibration.calibrate import PARAMETERS, Calibration, calibrate
-from diffdrive_jacobian.calibration.measurements import (
+from diffdrive_jacobian.calibration.model import (
     CalibrationDrive,
     CalibrationError,
     Given,

@@ -9,22 +9,20 @@ import numpy as np
 
 from diffdrive_jacobian.calibration.clock import time_offset
 from diffdrive_jacobian.calibration.consistency import misfit
-from diffdrive_jacobian.calibration.estimate import (
+from diffdrive_jacobian.calibration.fit import fit
+from diffdrive_jacobian.calibration.initial_estimate import initial_estimate, unit
+from diffdrive_jacobian.calibration.model import (
     TIME_OFFSETS,
     UNDETERMINED,
     YAW_OFFSET,
-    Estimate,
-    undetermined,
-)
-from diffdrive_jacobian.calibration.fit import fit
-from diffdrive_jacobian.calibration.initial_estimate import initial_estimate, unit
-from diffdrive_jacobian.calibration.measurements import (
     Array,
     CalibrationDrive,
     CalibrationError,
+    Estimate,
     Given,
     Noise,
     Segment,
+    undetermined,
 )
 from diffdrive_jacobian.calibration.motion import Geometry, composed
 from diffdrive_jacobian.calibration.preparation import (

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.calibration.measurements import Array, CalibrationDrive, CalibrationError
+from diffdrive_jacobian.calibration.model import Array, CalibrationDrive, CalibrationError
 from diffdrive_jacobian.calibration.motion import Geometry
 
 WINDOW = 0.5

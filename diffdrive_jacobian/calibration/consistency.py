@@ -15,11 +15,17 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.calibration.encoder import poses_apart
-from diffdrive_jacobian.calibration.estimate import MULTIPLIERS, TIME_OFFSETS, Estimate, prior_deviations
 from diffdrive_jacobian.calibration.fit import score
-from diffdrive_jacobian.calibration.measurements import Array, Segment
+from diffdrive_jacobian.calibration.model import (
+    MULTIPLIERS,
+    TIME_OFFSETS,
+    Array,
+    Estimate,
+    Segment,
+    prior_deviations,
+)
 from diffdrive_jacobian.calibration.motion import Geometry
+from diffdrive_jacobian.calibration.preparation import poses_apart
 
 WINDOWS = 64
 """Number of windows of equal distances into which all drives are divided."""

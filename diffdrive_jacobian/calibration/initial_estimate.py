@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.calibration.measurements import Array, CalibrationError, Segment
+from diffdrive_jacobian.calibration.model import Array, CalibrationError, Segment
 from diffdrive_jacobian.calibration.motion import (
     Geometry,
     Increments,

@@ -4,9 +4,7 @@ With `from diffdrive_jacobian import faults`, a test calls
 `lockstep.inject(faults.Loss('odom', probability=0.5, start=2.0, duration=1.0))`.
 """
 
-from diffdrive_jacobian.faults.corruption import Corrupt
 from diffdrive_jacobian.faults.fault import Fault, Filter, TopicFault
-from diffdrive_jacobian.faults.nodes import Hang, Kill, NodeFault, Slow, TimerJitter
 from diffdrive_jacobian.faults.robot import (
     ActuatorLag,
     DeadWheel,
@@ -17,8 +15,18 @@ from diffdrive_jacobian.faults.robot import (
     Slip,
     WrongGeometry,
 )
-from diffdrive_jacobian.faults.topics import Delay, Duplicate, Loss, RateLimit, Reorder, Stale
-from diffdrive_jacobian.faults.world import ClockPause, LateService, ParameterChange, TimeJump
+from diffdrive_jacobian.faults.topics import Corrupt, Delay, Duplicate, Loss, RateLimit, Reorder, Stale
+from diffdrive_jacobian.faults.world import (
+    ClockPause,
+    Hang,
+    Kill,
+    LateService,
+    NodeFault,
+    ParameterChange,
+    Slow,
+    TimeJump,
+    TimerJitter,
+)
 from diffdrive_jacobian.lockstep._fault_log import FaultEvent
 from diffdrive_jacobian.lockstep._injection import Injection
 

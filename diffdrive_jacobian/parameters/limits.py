@@ -9,7 +9,7 @@ from typing import Any
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
 from diffdrive_jacobian.parameters.declaration import NodeParameters, parameter
-from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
+from diffdrive_jacobian.simulation.actuators import AccelerationLimits, AxisLimits
 
 _GREATEST = 1e6
 _RATES = {

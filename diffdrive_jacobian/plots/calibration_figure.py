@@ -12,7 +12,7 @@ import numpy as np
 
 from diffdrive_jacobian.bags.time_series import line
 from diffdrive_jacobian.calibration.calibrate import Calibration
-from diffdrive_jacobian.calibration.errors import Track, compared_distance, rms, tracks
+from diffdrive_jacobian.calibration.description import Track, compared_distance, rms, tracks
 from diffdrive_jacobian.plots.rendering import render, styled
 
 if TYPE_CHECKING:

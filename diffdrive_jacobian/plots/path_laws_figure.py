@@ -41,7 +41,7 @@ def path_laws() -> Figure:
     """
     from matplotlib.figure import Figure
 
-    from diffdrive_jacobian.simulation.path_tracking import follow_path
+    from diffdrive_jacobian.simulation.tracking import follow_path
 
     drawing = Figure(figsize=(5.0, 4.2), layout='constrained')
     above, errors = drawing.subplots(2, 1, height_ratios=[1.1, 1.0])

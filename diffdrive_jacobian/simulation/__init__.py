@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian import lazy
-from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.simulation.slip import Drift
 
@@ -19,8 +18,7 @@ if TYPE_CHECKING:
         sweep,
         sweep_table,
     )
-    from diffdrive_jacobian.simulation.path_tracking import follow_path
-    from diffdrive_jacobian.simulation.tracking import track_line
+    from diffdrive_jacobian.simulation.tracking import follow_path, track_line
 
 __all__ = [
     'AccelerationLimits',
@@ -48,7 +46,7 @@ if not TYPE_CHECKING:
             'SweepSetup': 'simulation.gain_sweep',
             'closed_loops': 'simulation.closed_loop',
             'describe_sweep': 'simulation.gain_sweep',
-            'follow_path': 'simulation.path_tracking',
+            'follow_path': 'simulation.tracking',
             'sweep': 'simulation.gain_sweep',
             'sweep_table': 'simulation.gain_sweep',
             'track_line': 'simulation.tracking',

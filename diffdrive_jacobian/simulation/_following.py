@@ -11,15 +11,19 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.numerics.elementary import sinc
-from diffdrive_jacobian.simulation._batch import Array, Batch, Mask, Rows
-from diffdrive_jacobian.simulation.acceleration import SHORTEST, AxisLimits
-from diffdrive_jacobian.simulation.actuators import SETTLING, Actuators
+from diffdrive_jacobian.simulation.actuators import SETTLING, SHORTEST, Actuators, AxisLimits
 from diffdrive_jacobian.time_units import NANOSECONDS
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.intp]
 
 AT_REST = 1e-9
 """Speed below which a robot counts as being at rest (m/s, rad/s)."""
@@ -67,11 +71,12 @@ class Follower:
         self.targets = deque(target[:, going] for target in self.targets)
         self._take(self.demanded[:, going], self.twist[:, going])
 
-    def steps(self, batch: Batch, command: Array) -> Iterator[tuple[Rows, Array, Array]]:
+    def steps(self, r: Any, L: Any, command: Array) -> Iterator[tuple[Rows, Array, Array]]:
         """Let the robots drive until the next sample.
 
         Args:
-            batch: The batch of these robots.
+            r: Wheel radius, one for all or that of each robot (m).
+            L: Wheel separation, likewise (m).
             command: Their twists that are commanded now.
 
         Yields:
@@ -81,13 +86,13 @@ class Follower:
         self.targets.append(command)
         late, rest = self.shares
         if late:
-            yield from self._follow(batch, late)
+            yield from self._follow(r, L, late)
         self.targets.popleft()
-        yield from self._follow(batch, rest)
+        yield from self._follow(r, L, rest)
 
-    def _follow(self, batch: Batch, seconds: float) -> Iterator[tuple[Rows, Array, Array]]:
+    def _follow(self, r: Any, L: Any, seconds: float) -> Iterator[tuple[Rows, Array, Array]]:
         left = np.full(self.demanded.shape[1], seconds)
-        for end, duration in self._transition(batch, self.targets[0]):
+        for end, duration in self._transition(r, L, self.targets[0]):
             going = np.flatnonzero(left > 0.0)
             if not len(going):
                 return
@@ -101,13 +106,13 @@ class Follower:
                 course = begin[:, moving], slope[:, moving]
                 yield from self._piece(going[moving], time[moving], *course)
 
-    def _transition(self, batch: Batch, target: Array) -> Iterator[tuple[Array, Array]]:
+    def _transition(self, r: Any, L: Any, target: Array) -> Iterator[tuple[Array, Array]]:
         """Yield the ends and the durations of the parts of `AccelerationLimits.transition`."""
         start, limits = self.demanded.copy(), self.acceleration
         change = target - start
         crosses = np.minimum(start, target) * np.maximum(start, target) < 0.0
         zero = np.divide(-start, change, out=np.ones_like(start), where=crosses)
-        wheels = np.abs(body_to_wheel.formula(*change, batch.r, batch.L)).max(axis=0)
+        wheels = np.abs(body_to_wheel.formula(*change, r, L)).max(axis=0)
         slowest = wheels / limits.max_wheel_acceleration
         share, here = np.zeros(start.shape[1]), start
         for upto in (*np.sort(zero, axis=0), np.ones_like(share)):

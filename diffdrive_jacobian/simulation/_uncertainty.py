@@ -1,17 +1,145 @@
 """The uncertainty of a robot's pose along its path, computed when it is first needed.
 
-A robot gets a new state with every command, but its covariance is needed only where it is published.
-Each state keeps the arc that led to it and the state before. The moments of the error are evaluated
-along these arcs, in their order, so that they are the same to the last bit whenever that happens.
+The equations are those of `exact_moments`, along motions whose speeds change with v(t), omega(t) and the
+densities vv(t), vw(t), ww(t). With the heading `z = exp(i theta)` since the start, `m(t)` half the
+variance of the error psi of the heading, and `u = exp(i psi)`, the error gamma of the position, in the
+frame of the start, obeys
+
+    d gamma = z ((v + i vw/2) u - v) dt + z u dB_v
+
+Its expectations are integrals over t, computed by Gauss-Legendre quadrature. E[gamma^2] and E[|gamma|^2]
+need E[gamma], E[gamma u] and E[gamma* u] at the nodes, which are integrals of the polynomial through the
+nodes. The motion is split where a wheel changes its direction, because there the densities have a kink.
+
+Source: doc/mathematics.md, "Acceleration, lag and delay".
 """
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
+from math import cos, exp, expm1, isfinite, sin
+from operator import mul
 from typing import TypeAlias
 
-from diffdrive_jacobian.simulation._noise_quadrature import moments_along
-from diffdrive_jacobian.simulation.exact_moments import Entries, propagated_moments
-from diffdrive_jacobian.simulation.speeds import Piece
+from diffdrive_jacobian.simulation.exact_moments import (
+    Entries,
+    NoiseMoments,
+    central,
+    composed,
+    propagated_moments,
+)
+from diffdrive_jacobian.simulation.speeds import Course, Piece, sign_changes, travelled
+
+MAX_NOISE = 0.25
+"""Largest m of a step of the quadrature."""
+
+
+def moments_along(
+    moments: Entries, theta: float, piece: Piece, dt: float, L: float, k: float
+) -> Entries | None:
+    """Propagate the moments of the error along a step of a motion, exactly.
+
+    Args:
+        moments: Moments at the start.
+        theta: Reported heading at the start (rad).
+        piece: The twist as reported, at most a step of the quadrature.
+        dt: Its duration (s).
+        L: Wheel separation (m).
+        k: Variance per distance travelled of each wheel (m).
+
+    Returns:
+        The moments. None: they overflow.
+    """
+    right, left = _rims(piece, L)
+    turns = (*sign_changes(right, dt, piece.tau), *sign_changes(left, dt, piece.tau))
+    knots = [0.0, *sorted(turns), dt]
+    found: Entries | None = moments
+    try:
+        for begin, end in pairwise(knots):
+            distance = sum(
+                abs(travelled(rim, end, piece.tau) - travelled(rim, begin, piece.tau))
+                for rim in (right, left)
+            )
+            count = max(1, math.ceil(k * distance / (2.0 * L * L) / MAX_NOISE))
+            for number in range(count):
+                if found is None:
+                    return None
+                first = begin + (end - begin) * number / count
+                step = piece.part(first, begin + (end - begin) * (number + 1) / count)
+                found = _after(found, theta + travelled(piece.omega, first, piece.tau), step, L, k)
+    except (OverflowError, ValueError):
+        return None
+    return found if found is not None and all(map(isfinite, found)) else None
+
+
+def _rims(piece: Piece, L: float) -> tuple[Course, Course]:
+    """Return the speeds of the rims of the right and the left wheel."""
+    (a, b, c), (d, e, f) = piece.v, ((L / 2.0) * part for part in piece.omega)
+    return (a + d, b + e, c + f), (a - d, b - e, c - f)
+
+
+def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> Entries | None:
+    """Return the moments after a step in which no wheel changes its direction."""
+    T = piece.seconds
+    if piece.constant:
+        return propagated_moments(moments, theta, piece.twist(0.0), T, L, k)
+    v, omega = piece.twist(T / 2.0)
+    right = math.copysign(k, v + omega * L / 2.0)
+    left = math.copysign(k, v - omega * L / 2.0)
+    # k |v_R| + k |v_L| = p v + q omega, and k |v_R| - k |v_L| = r v + s omega.
+    p, q = right + left, (right - left) * L / 2.0
+    r, s = right - left, (right + left) * L / 2.0
+    nodes, partial = piece.quadrature(T)
+    # At the nodes: weight, heading, v, v + i vw/2, vv, m, exp(-m).
+    at: list[tuple[float, complex, float, complex, float, float, float]] = []
+    firsts, squares, products = [], [], []
+    displacement = first = of_psi = 0j
+    for node, weight in nodes:
+        v, omega, path, turn = piece.state(node * T)
+        m = (p * path + q * turn) / (2.0 * L * L)
+        vw = (r * v + s * omega) / (2.0 * L)
+        half, loss = 0.5j * vw, expm1(-m)
+        z, decay = complex(cos(turn), sin(turn)), 1.0 + loss
+        # Integrands of E[gamma], E[gamma u] / exp(-m) and E[gamma* u] / exp(-m).
+        inner = z * (v * loss + half * decay)
+        firsts.append(inner)
+        squares.append(z * (v * expm1(-3.0 * m) + 3.0 * half * decay**3))
+        products.append(z.conjugate() * (v * expm1(m) + half / decay))
+        displacement += weight * v * z
+        first += weight * inner
+        of_psi += weight * (z * decay * ((v + half) * 2j * m + vw))
+        at.append((weight, z, v, v + half, (p * v + q * omega) / 4.0, m, decay))
+    xx = xy = yy = 0.0
+    square = product = 0j
+    for row, (weight, z, v, drift, vv, m, decay), a, b in zip(
+        partial, at, squares, products, strict=True
+    ):
+        # E[gamma], E[gamma u] and E[gamma* u] at the node.
+        mean = T * sum(map(mul, row, firsts))
+        gamma_u = decay * T * sum(map(mul, row, squares))
+        conjugate_u = decay * T * sum(map(mul, row, products))
+        with_conjugate = z * (drift * conjugate_u - v * mean.conjugate())
+        with_gamma = z * (drift * gamma_u - v * mean)
+        lost, double = expm1(-4.0 * m), z * z
+        xx += weight * ((with_conjugate + with_gamma).real + vv * (z.real**2 + lost * double.real / 2.0))
+        yy += weight * ((with_conjugate - with_gamma).real + vv * (z.imag**2 - lost * double.real / 2.0))
+        xy += weight * (with_gamma.imag + vv * (1.0 + lost) * double.imag / 2.0)
+        square, product = square + weight * a, product + weight * b
+    _, _, path, turn = piece.state(T)
+    m = (p * path + q * turn) / (2.0 * L * L)
+    first, of_psi, decay = first * T, of_psi * T, exp(-m)
+    # E[gamma (exp(i psi) - 1)] and E[gamma* (exp(i psi) - 1)] at the end.
+    a, b = decay * square * T - first, decay * product * T - first.conjugate()
+    noise = NoiseMoments(
+        *(first.real, first.imag, xx * T, xy * T, yy * T, of_psi.real, of_psi.imag),
+        *((a.real + b.real) / 2.0, (a.imag + b.imag) / 2.0),
+        *((a.imag - b.imag) / 2.0, (b.real - a.real) / 2.0),
+    )
+    cosine, sine = cos(theta), sin(theta)
+    g = complex(cosine, sine) * displacement * T
+    return composed(moments, cosine, sine, g.real, g.imag, m, central(noise, m) if m else None)
+
 
 Arc: TypeAlias = tuple[float, tuple[float, float] | Piece, float, float, float]
 """Heading at the start (rad), twist (m/s, rad/s), or how it changes with time, duration (s), wheel

@@ -23,8 +23,7 @@ from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import Controller, Law
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import function
-from diffdrive_jacobian.simulation._batch import Array, Batch, Outcomes, Rows
-from diffdrive_jacobian.simulation._block import Block, Keep
+from diffdrive_jacobian.simulation._block import Array, Batch, Block, Keep, Outcomes, Rows
 from diffdrive_jacobian.simulation.actuators import Actuators
 
 BLOCK = 8192

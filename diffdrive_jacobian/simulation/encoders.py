@@ -13,8 +13,8 @@ import math
 from dataclasses import dataclass, replace
 
 from diffdrive_jacobian.numerics.fields import integer
-from diffdrive_jacobian.simulation.arc import arc_end
 from diffdrive_jacobian.simulation.robot import Robot
+from diffdrive_jacobian.simulation.speeds import arc_end
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_PER_REVOLUTION = 10**9

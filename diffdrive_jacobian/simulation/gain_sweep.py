@@ -22,8 +22,7 @@ from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.numerics.checks import Positive, array
 from diffdrive_jacobian.numerics.fields import Checked, Count, choices, instance, integer, short
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
-from diffdrive_jacobian.simulation._batch import Outcomes
-from diffdrive_jacobian.simulation._block import LOST
+from diffdrive_jacobian.simulation._block import LOST, Outcomes
 
 Array = NDArray[np.float64]
 

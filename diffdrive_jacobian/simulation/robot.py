@@ -39,13 +39,12 @@ from diffdrive_jacobian.numerics.checks import (
 from diffdrive_jacobian.numerics.fields import instance
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
 from diffdrive_jacobian.simulation.actuators import Drive, Speeds
-from diffdrive_jacobian.simulation.arc import arc_end
 from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian
 from diffdrive_jacobian.simulation.odometry_noise import twist_covariance
 from diffdrive_jacobian.simulation.robot_model import RobotModel as RobotModel
 from diffdrive_jacobian.simulation.robot_model import pair
 from diffdrive_jacobian.simulation.slip import Truth
-from diffdrive_jacobian.simulation.speeds import Piece, displaced
+from diffdrive_jacobian.simulation.speeds import Piece, arc_end, displaced
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 STANDSTILL = (0.0, 0.0)

@@ -37,8 +37,7 @@ import numpy as np
 
 from diffdrive_jacobian.numerics.checks import Positive
 from diffdrive_jacobian.numerics.fields import Checked, integer, optional
-from diffdrive_jacobian.simulation.arc import arc_end
-from diffdrive_jacobian.simulation.speeds import Piece, Profile, moved, rolled
+from diffdrive_jacobian.simulation.speeds import Piece, Profile, arc_end, moved, rolled
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 CELL = 20_000_000

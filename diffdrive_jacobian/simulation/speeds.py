@@ -19,11 +19,12 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator
 from itertools import pairwise
-from math import cos, exp, expm1, sin, sqrt
+from math import cos, exp, expm1, isfinite, sin, sqrt
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -294,3 +295,24 @@ def rolled(course: Course, piece: Piece, seconds: float) -> float:
     times = [0.0, *sign_changes(course, seconds, piece.tau), seconds]
     places = [travelled(course, time, piece.tau) for time in times]
     return sum(abs(end - begin) for begin, end in pairwise(places))
+
+
+def arc_end(
+    x: float, y: float, theta: float, v: float, omega: float, dt: float
+) -> tuple[float, float, float]:
+    """Compute `se2.integrate` for one pose, from floats that are finite.
+
+    Returns:
+        `(x, y, theta)` at the end.
+
+    Raises:
+        ValueError: The result overflows.
+    """
+    try:
+        end_x, end_y, end_theta = integrate.formula((x, y, theta), (v, omega), dt)
+        if isfinite(end_x) and isfinite(end_y) and isfinite(end_theta):
+            return end_x, end_y, end_theta
+    except ValueError:
+        # math.sin(inf)
+        pass
+    raise ValueError('pose, twist and dt must give a finite result, but it overflows')

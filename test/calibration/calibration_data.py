@@ -9,7 +9,7 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 from support.ros_messages import pose_message, stamp
 
-from diffdrive_jacobian.calibration.measurements import CalibrationDrive, Noise
+from diffdrive_jacobian.calibration.model import CalibrationDrive, Noise
 from diffdrive_jacobian.calibration.motion import Geometry, composed
 
 NOMINAL = Geometry(wheel_radius=0.033, wheel_separation=0.16)

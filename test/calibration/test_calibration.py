@@ -14,13 +14,16 @@ from calibration_data import NOISE, NOMINAL, TRUE, Drive, Simulation, square, um
 
 from diffdrive_jacobian.calibration import CalibrationError, Given, Noise, calibrate, preparation
 from diffdrive_jacobian.calibration.consistency import misfit
-from diffdrive_jacobian.calibration.description import explain_undetermined
-from diffdrive_jacobian.calibration.encoder import PERIOD, densified, located
-from diffdrive_jacobian.calibration.errors import compared_distance, rms, tracks
-from diffdrive_jacobian.calibration.estimate import Estimate, undetermined
+from diffdrive_jacobian.calibration.description import (
+    compared_distance,
+    explain_undetermined,
+    rms,
+    tracks,
+)
 from diffdrive_jacobian.calibration.fit import fit, information
+from diffdrive_jacobian.calibration.model import Estimate, undetermined
 from diffdrive_jacobian.calibration.motion import composed, increments, inverted, relative
-from diffdrive_jacobian.calibration.preparation import overlapping, without
+from diffdrive_jacobian.calibration.preparation import PERIOD, densified, located, overlapping, without
 from diffdrive_jacobian.kinematics.se2 import adjoint
 
 SHORT = Drive.of(umbmark(side=1.0, runs=1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diffdrive_jacobian.calibration.normal_equations import solve_block_tridiagonal
+from diffdrive_jacobian.calibration.fit import solve_block_tridiagonal
 
 
 @pytest.mark.parametrize('count', [1, 2, 3, 4, 5, 8, 13, 17])

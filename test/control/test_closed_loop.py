@@ -23,8 +23,7 @@ from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loop, closed_loops, trajectories
-from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 
 R, L = 0.033, 0.16
 FREE = VelocityLimits()

@@ -19,7 +19,7 @@ from std_msgs.msg import Bool, Byte, Empty, Int8, Int64, String, UInt8
 from support.lockstep_nodes import QUICK, Topics, add_team, arrives
 from support.ros_messages import goal, odometry, time_of
 
-from diffdrive_jacobian.faults.corruption import Corrupt
+from diffdrive_jacobian.faults.topics import Corrupt
 
 SECOND = 1_000_000_000
 

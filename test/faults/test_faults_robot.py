@@ -16,7 +16,6 @@ from support.lockstep_nodes import Topics, change, make
 from support.ros_messages import instants, pose_of, twist, twist_stamped, twists
 
 from diffdrive_jacobian.control import VelocityLimits
-from diffdrive_jacobian.faults.nodes import Kill
 from diffdrive_jacobian.faults.robot import (
     ActuatorLag,
     DeadWheel,
@@ -26,6 +25,7 @@ from diffdrive_jacobian.faults.robot import (
     Slip,
     WrongGeometry,
 )
+from diffdrive_jacobian.faults.world import Kill
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.kinematics.se2 import compose, integrate, inverse, wrap_angle
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot

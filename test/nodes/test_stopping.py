@@ -16,8 +16,7 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.stopping import overshoot_warnings, rolls_on
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loops
-from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 
 SLOW = {'linear.x.max_acceleration': 0.4, 'linear.x.max_deceleration': -0.1}
 ACTUATORS = Actuators(

@@ -10,8 +10,7 @@ import pytest
 
 from diffdrive_jacobian.control import VelocityLimits
 from diffdrive_jacobian.simulation import Robot, RobotModel
-from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 from diffdrive_jacobian.simulation.slip import Drift
 
 SECOND = 1_000_000_000

@@ -11,15 +11,17 @@ from support.moments_reference import DRIVES, noisy_runs, reference
 
 from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.simulation import Robot, RobotModel
-from diffdrive_jacobian.simulation._noise_moments import (
+from diffdrive_jacobian.simulation.exact_moments import (
     SHORT_NOISE,
     SHORT_TURN,
+    Moments,
     NoiseMoments,
     central,
+    gaussian,
+    propagate_moments,
     series,
     short_arc,
 )
-from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian, propagate_moments
 from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance
 
 L, K = 0.16, 1e-5
