@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -59,45 +60,14 @@ class Outcomes(NamedTuple):
     pose: Array
 
 
-def _followed(name: str, value: object) -> Actuators | None:
-    """Require actuators whose motors are fast enough; None: at once."""
-    actuators: Actuators | None = optional(partial(instance, wanted=Actuators))(name, value)
-    if actuators is None:
-        return None
-    if min(actuators.max_right_speed, actuators.max_left_speed) < math.inf:
-        raise ValueError(
-            f'{name} must have no max_right_speed or max_left_speed: in batches no motor saturates'
-        )
-    return None if actuators.immediate else actuators
-
-
-@dataclass(frozen=True, kw_only=True)
 class Batch:
-    """A batch. Values that are equal for all robots are numbers, others have a first axis of robots."""
+    """The arguments of a batch, checked and flattened.
 
-    law: Law
-    equation: Law | None
-    """The law of components without checks, where it is a `formula`."""
-    state: tuple[float, ...]
-    """What the law remembers at the start, as of `Controller`."""
-    starts: Array
-    goals: Array
-    gains: tuple[Any, ...]
-    rate: float
-    steps: int
-    arrival: Arrival
-    turning_gain: Any
-    limits: VelocityLimits
-    r: Any
-    L: Any
-    actuators: Actuators | None
-    """None: the robots follow commands at once."""
-    shape: tuple[int, ...]
-    """Shape of the batch before it was flattened."""
+    Values that are equal for all robots are numbers, others have a first axis of robots.
+    """
 
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         law: Law | Controller,
         starts: ArrayLike,
         goals: ArrayLike,
@@ -110,92 +80,83 @@ class Batch:
         r: ArrayLike,
         L: ArrayLike,
         actuators: Actuators | None,
-    ) -> Batch:
-        """Check the arguments and flatten the batch."""
-        arrival = Arrival() if arrival is None else arrival
-        state: tuple[float, ...] = ()
+    ) -> None:
+        # What the law remembers at the start.
+        self.state: tuple[float, ...] = ()
         if isinstance(law, Controller):
-            state, law = law.state, law.law
-        else:
-            function('law', law)
-        instance('arrival', arrival, Arrival)
-        instance('limits', limits, VelocityLimits)
-        actuators = _followed('actuators', actuators)
+            self.state, law = law.state, law.law
+        self.law: Law = function('law', law)
+        # The law of components without checks, where it is a `formula`.
+        self.equation: Law | None = getattr(law, 'formula', None)
+        self.arrival: Arrival = instance('arrival', Arrival() if arrival is None else arrival, Arrival)
+        self.limits: VelocityLimits = instance('limits', limits, VelocityLimits)
+        self.actuators = _checked(actuators)
         starts, goals = array('starts', starts, 3), array('goals', goals, 'm')
-        if goals.shape[-1] not in (2, 3) or (arrival.use_heading and goals.shape[-1] != 3):
-            wanted = '(..., 3)' if arrival.use_heading else '(..., 2) or (..., 3)'
+        size = goals.shape[-1]
+        if size not in (2, 3) or (self.arrival.use_heading and size != 3):
+            wanted = '(..., 3)' if self.arrival.use_heading else '(..., 2) or (..., 3)'
             raise ValueError(f'goals must have shape {wanted}, got {goals.shape}')
-        rate = number('rate', rate, positive)
+        self.rate = rate = number('rate', rate, positive)
         duration = number('duration', duration, positive)
         if not duration * rate < MAX_STEPS:
             raise ValueError(
                 f'duration must be below {MAX_STEPS / rate:g} s at that rate, got {duration:g}'
             )
+        self.steps = math.ceil(duration * rate - 1e-9)
         columns = {f'gain {index}': array(f'gain {index}', gain) for index, gain in enumerate(gains)}
         columns['turning_gain'] = array('turning_gain', turning_gain)
-        columns['offset'] = floats('offset', arrival.offset)
-        columns.update(r=floats('r', r), L=floats('L', L))
-        positive('r', columns['r'])
-        positive('L', columns['L'])
-        columns.update(
-            zip(limits.names(), (floats('limits', limit) for limit in limits.all()), strict=True)
-        )
-        shape = leading(
+        columns['offset'] = floats('offset', self.arrival.offset)
+        for name, value in (('r', r), ('L', L)):
+            columns[name] = floats(name, value)
+            positive(name, columns[name])
+        for name, limit in zip(limits.names(), limits.all(), strict=True):
+            columns[name] = floats('limits', limit)
+        # Of the batch before it was flattened.
+        self.shape = shape = leading(
             starts=starts.shape[:-1],
             goals=goals.shape[:-1],
             **{name: value.shape for name, value in columns.items()},
         )
-        flat = {
-            name: float(value) if value.ndim == 0 else np.broadcast_to(value, shape).reshape(-1)
-            for name, value in columns.items()
-        }
-        return cls(
-            law=law,
-            equation=getattr(law, 'formula', None),
-            state=state,
-            starts=np.broadcast_to(starts, (*shape, 3)).reshape(-1, 3),
-            goals=np.broadcast_to(goals, (*shape, goals.shape[-1])).reshape(-1, goals.shape[-1]),
-            gains=tuple(flat[f'gain {index}'] for index in range(len(gains))),
-            rate=rate,
-            steps=math.ceil(duration * rate - 1e-9),
-            arrival=replace(arrival, offset=flat['offset']),
-            turning_gain=flat['turning_gain'],
-            limits=VelocityLimits(**{name: flat[name] for name in limits.names()}),
-            r=flat['r'],
-            L=flat['L'],
-            actuators=actuators,
-            shape=shape,
+        self.starts: Array = np.broadcast_to(starts, (*shape, 3)).reshape(-1, 3)
+        self.goals: Array = np.broadcast_to(goals, (*shape, size)).reshape(-1, size)
+        self._take(
+            {
+                name: float(value) if value.ndim == 0 else np.broadcast_to(value, shape).reshape(-1)
+                for name, value in columns.items()
+            }
         )
 
-    @property
-    def size(self) -> int:
-        """Number of robots."""
-        return len(self.starts)
-
-    @property
-    def remembered(self) -> dict[str, Any]:
-        """Arguments of a law with a state, at the start."""
-        return {'state': np.array(self.state), 'dt': 0.0} if self.state else {}
+    def _take(self, columns: dict[str, Any]) -> None:
+        """Set the values that may differ between robots."""
+        self._columns = columns
+        self.gains = [value for name, value in columns.items() if name.startswith('gain ')]
+        self.turning_gain, self.r, self.L = (columns[name] for name in ('turning_gain', 'r', 'L'))
+        self.arrival = replace(self.arrival, offset=columns['offset'])
+        self.limits = VelocityLimits(**{name: columns[name] for name in self.limits.names()})
 
     def some(self, rows: Any) -> Batch:
         """Return the batch of some of the robots, each coordinate contiguous in memory."""
-
-        def pick(value: Any) -> Any:
-            return value if isinstance(value, float) else value[rows]
-
-        return replace(
-            self,
-            starts=np.array(self.starts[rows].T).T,
-            goals=np.array(self.goals[rows].T).T,
-            gains=tuple(map(pick, self.gains)),
-            arrival=replace(self.arrival, offset=pick(self.arrival.offset)),
-            turning_gain=pick(self.turning_gain),
-            limits=VelocityLimits(
-                **dict(zip(self.limits.names(), map(pick, self.limits.all()), strict=True))
-            ),
-            r=pick(self.r),
-            L=pick(self.L),
+        batch = copy(self)
+        batch.starts, batch.goals = (np.array(one[rows].T).T for one in (self.starts, self.goals))
+        batch._take(
+            {
+                name: value if isinstance(value, float) else value[rows]
+                for name, value in self._columns.items()
+            }
         )
+        return batch
+
+
+def _checked(actuators: Actuators | None) -> Actuators | None:
+    """Require actuators whose motors are fast enough; None: commands are followed at once."""
+    optional(partial(instance, wanted=Actuators))('actuators', actuators)
+    if actuators is None:
+        return None
+    if min(actuators.max_right_speed, actuators.max_left_speed) < math.inf:
+        raise ValueError(
+            'actuators must have no max_right_speed or max_left_speed: in batches no motor saturates'
+        )
+    return None if actuators.immediate else actuators
 
 
 LOST = 1e6

@@ -79,17 +79,14 @@ class AxisLimits(Checked):
             return self.max_deceleration_reverse if speed < 0.0 else self.max_acceleration
         return -self.max_deceleration if speed > 0.0 else -self.max_acceleration_reverse
 
-    def stopping_distance(self, speed: float) -> float:
-        """Return the distance, not negative, that is travelled from a speed to rest."""
-        return speed * speed / 2.0 / self.rate(speed, -speed)
-
     @property
     def unlimited(self) -> bool:
         """Whether no limit is set."""
-        return self == _NO_AXIS_LIMITS
+        return self == _NO_LIMITS
 
 
-_NO_AXIS_LIMITS = AxisLimits()
+_NO_LIMITS = AxisLimits()
+_Axis = Annotated[AxisLimits, partial(instance, wanted=AxisLimits)]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -100,10 +97,8 @@ class AccelerationLimits(Checked):
         ValueError: A field is of another class, or the limit of the wheels is not positive.
     """
 
-    v: Annotated[AxisLimits, partial(instance, wanted=AxisLimits)] = field(default_factory=AxisLimits)
-    omega: Annotated[AxisLimits, partial(instance, wanted=AxisLimits)] = field(
-        default_factory=AxisLimits
-    )
+    v: _Axis = _NO_LIMITS
+    omega: _Axis = _NO_LIMITS
     max_wheel_acceleration: PositiveOrInfinite = math.inf
     """Largest angular acceleration of either wheel (rad/s^2)."""
 
@@ -174,12 +169,15 @@ class Wheels(Protocol):
         """Return the twist of wheel speeds."""
 
 
-def _delay(name: str, value: object) -> int:
+def _duration(name: str, value: object) -> int:
     """Require a duration that is not negative (ns)."""
-    delay = nanoseconds(name, value)
-    if delay < 0:
-        raise ValueError(f'{name} must be zero or positive (ns), got {delay}')
-    return delay
+    duration = nanoseconds(name, value)
+    if duration < 0:
+        raise ValueError(f'{name} must be zero or positive (ns), got {duration}')
+    return duration
+
+
+Duration = Annotated[int, _duration]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -202,7 +200,7 @@ class Actuators(Checked):
         default_factory=AccelerationLimits
     )
     """Limits of the acceleration."""
-    delay: Annotated[int, _delay] = 0
+    delay: Duration = 0
     """Time from a command to its effect on the motors (ns)."""
 
     def lagging(self, seconds: float) -> Actuators:
@@ -307,8 +305,8 @@ class Drive(NamedTuple):
         Args:
             stamp: The time (ns).
             target: The twist, within the limits of the velocity.
-            actuators: What the robot follows it with.
-            wheels: Its wheels.
+            actuators: The motors from now on.
+            wheels: The wheels from now on.
         """
         now = self.demanded.seconds(stamp)
         then = self.demanded.seconds(stamp + actuators.delay)

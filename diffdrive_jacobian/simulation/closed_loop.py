@@ -94,7 +94,7 @@ def closed_loops(
         ValueError: An argument has a wrong shape or value, the law returns something invalid, or an
             outcome overflows.
     """
-    batch = Batch.of(
+    batch = Batch(
         law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L, actuators
     )
     if progress is not None:
@@ -122,17 +122,18 @@ def trajectories(
 
     Arguments and errors are those of `closed_loops`.
     """
-    batch = Batch.of(
+    batch = Batch(
         law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L, actuators
     )
-    if (batch.steps + 1) * batch.size > MAX_SAMPLES:
+    count = len(batch.starts)
+    if (batch.steps + 1) * count > MAX_SAMPLES:
         raise ValueError(
             f'duration must be shorter, because at most {MAX_SAMPLES:g} samples are kept, '
-            f'got {duration:g} with {batch.size} robots'
+            f'got {duration:g} with {count} robots'
         )
-    poses = np.empty((batch.steps + 1, batch.size, 3))
-    twists = np.zeros((batch.steps, batch.size, 2))
-    last = np.zeros(batch.size, dtype=np.intp)
+    poses = np.empty((batch.steps + 1, count, 3))
+    twists = np.zeros((batch.steps, count, 2))
+    last = np.zeros(count, dtype=np.intp)
 
     def keep(step: int, rows: Rows, at: Array, v: Any, omega: Any) -> None:
         poses[step, rows], last[rows] = at, step
@@ -142,7 +143,7 @@ def trajectories(
     outcomes = _drive(batch, keep)
     steps = int(max(last, default=0))
     held = np.minimum(np.arange(steps + 1)[:, np.newaxis], last)
-    poses = poses[held, np.arange(batch.size)]
+    poses = poses[held, np.arange(count)]
     return Trajectories(
         np.arange(steps + 1) / rate,
         poses.reshape(steps + 1, *batch.shape, 3),
@@ -161,10 +162,11 @@ def _drive(
     if batch.equation is not None:
         # The law checks its arguments, the equation does not.
         try:
-            batch.law(batch.starts, batch.goals, *batch.gains, **batch.remembered)
+            state = {'state': np.array(batch.state), 'dt': 0.0} if batch.state else {}
+            batch.law(batch.starts, batch.goals, *batch.gains, **state)
         except ValueError as error:
             raise ValueError(f'law rejects the starts, goals and gains: {error}') from error
-    count = batch.size
+    count = len(batch.starts)
     found = Outcomes(
         np.zeros(count, dtype=np.bool_),
         np.full(count, np.nan),

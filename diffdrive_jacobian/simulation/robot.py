@@ -5,12 +5,9 @@ State at a time: pose `[x, y, theta]` (m, m, rad) with its covariance, wheel ang
 timestamps. Times are integer nanoseconds, so that Unix time loses no precision.
 
 The state is stored at the last event (command, timeout, placement). Every later state is computed from
-it along one exact arc, so the motion does not depend, to the last bit, on when states are computed. With
-`actuators` that take time (limits of the acceleration, a lag, a delay) it is computed along the `Drive`
-that began with that event, and the same holds.
-
-A state is computed in floats, its covariance when it is first read, and arrays whenever they are read. A
-node that needs no arrays reads `pose_tuple` and `covariance_tuple`.
+it along one exact arc, or with `actuators` that take time along the `Drive` that began with that event.
+So the motion does not depend, to the last bit, on when states are computed. Covariances and arrays are
+computed when they are read: a node that needs none reads the tuples.
 
 The pose is that of the odometry, computed from the turns of the wheels. The robot is truly there, unless
 its model has a `drift`. `true_pose` is where it truly is.
@@ -20,7 +17,6 @@ Source: doc/mathematics.md, "Motion".
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import isfinite
 from typing import TypeAlias
 
@@ -38,19 +34,19 @@ from diffdrive_jacobian.numerics.checks import (
 )
 from diffdrive_jacobian.numerics.fields import instance
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
+from diffdrive_jacobian.simulation.actuators import STANDSTILL as STANDSTILL
 from diffdrive_jacobian.simulation.actuators import Drive, Speeds
 from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian
 from diffdrive_jacobian.simulation.odometry_noise import twist_covariance
 from diffdrive_jacobian.simulation.robot_model import RobotModel as RobotModel
 from diffdrive_jacobian.simulation.robot_model import pair
 from diffdrive_jacobian.simulation.slip import Truth
-from diffdrive_jacobian.simulation.speeds import Piece, arc_end, displaced
+from diffdrive_jacobian.simulation.speeds import Piece, Pose, Twist, arc_end, displaced
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-STANDSTILL = (0.0, 0.0)
 _CERTAIN = read_only(np.zeros((3, 3)))
-_State: TypeAlias = tuple[tuple[float, float, float], tuple[float, float], Uncertainty, Truth | None]
-"""Pose, wheel angles, uncertainty and truth at a time."""
+_State: TypeAlias = tuple[Pose, Speeds, Uncertainty, Truth | None]
+"""Pose, wheel angles, uncertainty and truth at a time. Truth None: the pose is the true one."""
 
 
 class Robot:
@@ -62,35 +58,9 @@ class Robot:
     """
 
     __slots__ = (
-        *(
-            '_model',
-            '_stamp',
-            '_pose',
-            '_wheel_angles',
-            '_command',
-            '_twist',
-            '_commanded_at',
-            '_expiry',
-        ),
-        *('_uncertainty', '_truth', '_drive', '_ahead', '_knot'),
+        *('_ahead', '_command', '_commanded_at', '_drive', '_expiry'),
+        *('_knot', '_model', '_stamp', '_state', '_twist'),
     )
-    _model: RobotModel
-    _stamp: int
-    _pose: tuple[float, float, float]
-    _wheel_angles: Speeds
-    _command: tuple[float, float]
-    _twist: tuple[float, float]
-    _commanded_at: int | None
-    _expiry: int | None
-    _uncertainty: Uncertainty
-    # None: the pose is the true one.
-    _truth: Truth | None
-    # None: the twist is held until the next event.
-    _drive: Drive | None
-    # The last state that was computed from this one, because often the same one is needed next.
-    _ahead: tuple[int, _State] | None
-    # Where the last state that was computed along the drive begins (s), and the state there.
-    _knot: tuple[float, _State] | None
 
     def __init__(
         self,
@@ -117,17 +87,37 @@ class Robot:
             commanded_at: Time at which the command took effect (ns); None: it is zero.
         """
         instance('model', model, RobotModel)
-        self._model, self._stamp = model, nanoseconds('stamp', stamp)
-        self._pose = _triple('pose', pose)
-        self._uncertainty = Uncertainty(tuple(gaussian(covariance)))
-        self._truth = _truth(model, self._pose)
-        self._wheel_angles = pair('wheel_angles', wheel_angles)
-        self._command, self._twist = pair('command', command), pair('twist', twist)
+        stamp, place = nanoseconds('stamp', stamp), _triple('pose', pose)
+        uncertainty = Uncertainty(tuple(gaussian(covariance)))
+        state = place, pair('wheel_angles', wheel_angles), uncertainty, _truth(model, place)
+        commanded, applied = pair('command', command), pair('twist', twist)
         if commanded_at is not None:
             commanded_at = nanoseconds('commanded_at', commanded_at)
-        self._commanded_at = commanded_at
-        self._expiry = _expiry(model, self._stamp, commanded_at)
-        self._drive = self._ahead = self._knot = None
+        self._set(model, stamp, state, commanded, applied, commanded_at)
+
+    def _set(
+        self,
+        model: RobotModel,
+        stamp: int,
+        state: _State,
+        command: Twist,
+        twist: Twist,
+        commanded_at: int | None = None,
+        drive: Drive | None = None,
+    ) -> None:
+        self._model, self._stamp, self._state = model, stamp, state
+        self._command, self._twist, self._commanded_at = command, twist, commanded_at
+        self._expiry: int | None = None
+        if commanded_at is not None and model.command_timeout:
+            # If the timeout was shortened, it expires now, not in the past.
+            expiry = commanded_at + model.command_timeout
+            self._expiry = expiry if expiry > stamp else stamp
+        # None: the twist is held until the next event.
+        self._drive = drive
+        # The last state that was computed from this one, because often the same one is needed next.
+        self._ahead: tuple[int, _State] | None = None
+        # Where the last state that was computed along the drive begins (s), and the state there.
+        self._knot: tuple[float, _State] | None = None
 
     def __repr__(self) -> str:
         """Return a constructor call with the values."""
@@ -156,12 +146,12 @@ class Robot:
     @property
     def pose(self) -> NDArray[np.float64]:
         """`[x, y, theta]`, shape (3,), read-only. `pose_tuple` has the same numbers without an array."""
-        return read_only(self._pose)
+        return read_only(self._state[0])
 
     @property
-    def pose_tuple(self) -> tuple[float, float, float]:
+    def pose_tuple(self) -> Pose:
         """`(x, y, theta)`, the pose as floats (m, m, rad)."""
-        return self._pose
+        return self._state[0]
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -177,35 +167,50 @@ class Robot:
         return read_only(np.reshape(self.covariance_tuple, (3, 3)))
 
     @property
-    def wheel_angles(self) -> Speeds:
-        """`(right, left)`, unwrapped (rad)."""
-        return self._wheel_angles
+    def covariance_tuple(self) -> tuple[float, ...]:
+        """The nine entries of the covariance by rows, as floats.
+
+        Raises:
+            ValueError: The covariance overflows.
+        """
+        xx, xy, xt, yy, yt, tt, *_ = self._state[2].moments()
+        return xx, xy, xt, xy, yy, yt, xt, yt, tt
 
     @property
-    def command(self) -> tuple[float, float]:
+    def moments(self) -> Moments:
+        """Moments of the error of the pose, from which its later uncertainty follows.
+
+        Raises:
+            ValueError: They overflow.
+        """
+        return Moments(*self._state[2].moments())
+
+    @property
+    def wheel_angles(self) -> Speeds:
+        """`(right, left)`, unwrapped (rad)."""
+        return self._state[1]
+
+    @property
+    def command(self) -> Twist:
         """The last commanded twist, `(v, omega)`."""
         return self._command
 
     @property
-    def twist(self) -> tuple[float, float]:
+    def twist(self) -> Twist:
         """The twist `(v, omega)` of the odometry at this time."""
         drive = self._drive
         return self._twist if drive is None else drive.motion.twist(drive.motion.seconds(self._stamp))
 
     @property
-    def target(self) -> tuple[float, float]:
-        """The twist that the robot is to reach: the command after saturation, as far as the motors
-        reach it.
-        """
+    def target(self) -> Twist:
+        """The twist to reach: the command after saturation, as far as the motors reach it."""
         return self._twist
 
     @property
     def settles_at(self) -> int:
         """Time from which on the twist is constant without a further event (ns)."""
         drive = self._drive
-        if drive is None:
-            return self._stamp
-        return max(self._stamp, drive.motion.settled_at)
+        return self._stamp if drive is None else max(self._stamp, drive.motion.settled_at)
 
     @property
     def commanded_at(self) -> int | None:
@@ -218,19 +223,10 @@ class Robot:
         return self._expiry
 
     @property
-    def covariance_tuple(self) -> tuple[float, ...]:
-        """The nine entries of the covariance by rows, as floats.
-
-        Raises:
-            ValueError: The covariance overflows.
-        """
-        xx, xy, xt, yy, yt, tt, *_ = self._uncertainty.moments()
-        return xx, xy, xt, xy, yy, yt, xt, yt, tt
-
-    @property
-    def true_pose_tuple(self) -> tuple[float, float, float]:
+    def true_pose_tuple(self) -> Pose:
         """`(x, y, theta)` of the true pose (m, m, rad); without drift that of the odometry."""
-        return self.pose_tuple if self._truth is None else self._truth.pose
+        pose, _, _, truth = self._state
+        return pose if truth is None else truth.pose
 
     @property
     def true_pose(self) -> NDArray[np.float64]:
@@ -238,31 +234,20 @@ class Robot:
         return np.array(self.true_pose_tuple)
 
     @property
-    def true_twist(self) -> tuple[float, float]:
+    def true_twist(self) -> Twist:
         """The true twist `(v, omega)` from this time on, the slip included (m/s, rad/s)."""
-        truth, model = self._truth, self.model
+        truth, drive = self._state[3], self._drive
         if truth is None:
             return self.twist
-        if self._drive is not None:
-            motion = self._drive.motion
-            return truth.twist_along(
-                motion, self.stamp, model.wheel_separation, model.wheel_travel_variance
-            )
-        return truth.twist(self.stamp, self.twist, model.wheel_separation, model.wheel_travel_variance)
+        L, k = self._model.wheel_separation, self._model.wheel_travel_variance
+        if drive is None:
+            return truth.twist(self._stamp, self._twist, L, k)
+        return truth.twist_along(drive.motion, self._stamp, L, k)
 
     @property
-    def moments(self) -> Moments:
-        """Moments of the error of the pose, from which its later uncertainty follows.
-
-        Raises:
-            ValueError: They overflow.
-        """
-        return Moments(*self._uncertainty.moments())
-
-    @property
-    def wheel_speeds(self) -> tuple[float, float]:
+    def wheel_speeds(self) -> Speeds:
         """`(omega_R, omega_L)` (rad/s), by the inverse wheel Jacobian."""
-        return self.model.wheel_speeds(*self.twist)
+        return self._model.wheel_speeds(*self.twist)
 
     def twist_covariance(self, interval: float) -> NDArray[np.float64]:
         """Compute the covariance of the twist as measured over an interval (s), shape (2, 2).
@@ -278,7 +263,7 @@ class Robot:
         Raises:
             ValueError: As `twist_covariance`.
         """
-        L, k = self.model.wheel_separation, self.model.wheel_travel_variance
+        L, k = self._model.wheel_separation, self._model.wheel_travel_variance
         interval = number('interval', interval, positive)
         (vv, vw), (wv, ww) = twist_covariance.formula(self.twist, L, k, interval)
         if not isfinite(vv + abs(vw) + ww):
@@ -286,35 +271,26 @@ class Robot:
         return vv, vw, wv, ww
 
     def at(self, stamp: int) -> Robot:
-        """Advance to a time, through the timeout if it expires before.
-
-        Args:
-            stamp: The time (ns).
+        """Advance to a time (ns), through the timeout if it expires before.
 
         Raises:
             ValueError: The time is earlier than this state, is not an integer, or so late that the
                 motion overflows.
         """
         stamp, robot, state = self._advanced(stamp)
-        command, twist, commanded_at = robot._command, robot._twist, robot._commanded_at
-        return _robot(robot._model, stamp, state, command, twist, commanded_at, robot._drive)
+        return robot._with(stamp, state)
 
     def commanded(self, command: ArrayLike, stamp: int) -> Robot:
-        """Apply a command from a time on, within the limits.
-
-        Args:
-            command: `[v, omega]`, shape (2,) (m/s, rad/s).
-            stamp: The time (ns).
+        """Apply a command `[v, omega]`, shape (2,) (m/s, rad/s), from a time (ns) on, within the limits.
 
         Raises:
             ValueError: The command has another shape or is not finite; or as `at`.
         """
         v, omega = pair('command', command)
-        model = self.model
-        twist = model.limited((v, omega))
+        twist = self._model.limited((v, omega))
         stamp, robot, state = self._advanced(stamp)
         commanded_at = None if v == omega == 0.0 else stamp
-        return robot._following(model, stamp, state, (v, omega), twist, commanded_at)
+        return robot._following(self._model, stamp, state, (v, omega), twist, commanded_at)
 
     def placed(
         self, pose: ArrayLike, covariance: ArrayLike, stamp: int, *, odometry_only: bool = False
@@ -332,14 +308,12 @@ class Robot:
             ValueError: The pose or the covariance is invalid, as in the constructor; or as `at`.
         """
         here = self.at(stamp)
-        placed = Robot(model=self.model, stamp=here.stamp, pose=pose, covariance=covariance)
-        truth = here._truth if odometry_only else placed._truth
-        state = placed.pose_tuple, here.wheel_angles, placed._uncertainty, truth
-        return here._with(state)
+        _, angles, _, truth = here._state
+        placed = Robot(model=self._model, stamp=here._stamp, pose=pose, covariance=covariance)
+        place, _, uncertainty, there = placed._state
+        return here._with(here._stamp, (place, angles, uncertainty, truth if odometry_only else there))
 
-    def reported(
-        self, pose: tuple[float, float, float], wheel_angles: Speeds, twist: tuple[float, float]
-    ) -> Robot:
+    def reported(self, pose: Pose, wheel_angles: Speeds, twist: Twist) -> Robot:
         """Return this robot as its sensors report it, with the same covariance and the same truth.
 
         Args:
@@ -350,10 +324,10 @@ class Robot:
         Raises:
             ValueError: An argument has another shape or is not finite.
         """
-        reported, angles = _triple('pose', pose), pair('wheel_angles', wheel_angles)
+        _, _, uncertainty, truth = self._state
+        state = _triple('pose', pose), pair('wheel_angles', wheel_angles), uncertainty, truth
         twist = pair('twist', twist)
-        state = reported, angles, self._uncertainty, self._truth
-        return _robot(self.model, self.stamp, state, self.command, twist, self.commanded_at)
+        return _robot(self._model, self._stamp, state, self._command, twist, self._commanded_at)
 
     def pushed(self, displacement: ArrayLike, stamp: int, *, noticed: bool = False) -> Robot:
         """Displace the robot without turning its wheels, with the same command.
@@ -370,16 +344,15 @@ class Robot:
         """
         displacement = _triple('displacement', displacement)
         here = self.at(stamp)
-        if here.model.drift is None and not noticed:
+        if here._model.drift is None and not noticed:
             raise ValueError('model must have a drift: without one the odometry is the true pose')
-        x, y, theta = compose(here.true_pose_tuple, displacement).tolist()
+        moved = _triple('pose', compose(here.true_pose_tuple, displacement))
         if noticed:
-            moved = compose(here.pose_tuple, displacement)
-            here = here.placed(moved, here.covariance, here.stamp, odometry_only=True)
-        pose, angles, uncertainty, truth = here._present
-        if truth is not None:
-            truth = truth.moved((x, y, theta))
-        return here._with((pose, angles, uncertainty, truth))
+            seen = compose(here.pose_tuple, displacement)
+            here = here.placed(seen, here.covariance, here._stamp, odometry_only=True)
+        pose, angles, uncertainty, truth = here._state
+        truth = None if truth is None else truth.moved(moved)
+        return here._with(here._stamp, (pose, angles, uncertainty, truth))
 
     def remodelled(self, model: RobotModel, stamp: int, *, wheels_commanded: bool = False) -> Robot:
         """Change the model. Its limits and timeout apply to the current command.
@@ -392,17 +365,17 @@ class Robot:
         """
         instance('model', model, RobotModel)
         here = self.at(stamp)
-        command = here.command
+        command = here._command
         if wheels_commanded:
-            command = model.twist(*self.model.wheel_speeds(*command))
+            command = model.twist(*self._model.wheel_speeds(*command))
         limited = model.limited(command)
-        pose, angles, uncertainty, truth = here._present
+        pose, angles, uncertainty, truth = here._state
         if truth is None or model.drift is None:
             truth = _truth(model, pose)
         else:
             truth = truth.with_drift(model.drift)
         state = pose, angles, uncertainty, truth
-        return here._following(model, here.stamp, state, command, limited, here.commanded_at)
+        return here._following(model, here._stamp, state, command, limited, here._commanded_at)
 
     def restarted(self, stamp: int) -> Robot:
         """Stop at the same pose, at a time that may be earlier.
@@ -411,38 +384,25 @@ class Robot:
             ValueError: The time is not an integer (ns).
         """
         stamp = nanoseconds('stamp', stamp)
-        pose, angles, uncertainty, truth = self._present
-        state = pose, angles, uncertainty, None if truth is None else truth.at_rest()
-        return _robot(self.model, stamp, state, STANDSTILL, STANDSTILL)
+        pose, angles, uncertainty, truth = self._state
+        truth = None if truth is None else truth.at_rest()
+        return _robot(self._model, stamp, (pose, angles, uncertainty, truth), STANDSTILL, STANDSTILL)
 
-    @property
-    def _present(self) -> _State:
-        return self.pose_tuple, self.wheel_angles, self._uncertainty, self._truth
-
-    def _with(self, state: _State) -> Robot:
-        """Return a robot that was put into another state, with the same motion."""
-        command, twist = self.command, self._twist
-        return _robot(self.model, self.stamp, state, command, twist, self.commanded_at, self._drive)
+    def _with(self, stamp: int, state: _State) -> Robot:
+        """Return the robot in another state, with the same motion."""
+        command, twist = self._command, self._twist
+        return _robot(self._model, stamp, state, command, twist, self._commanded_at, self._drive)
 
     def _following(
         self,
         model: RobotModel,
         stamp: int,
         state: _State,
-        command: tuple[float, float],
-        target: tuple[float, float],
+        command: Twist,
+        target: Twist,
         commanded_at: int | None,
     ) -> Robot:
-        """Return the robot in a state, from now on following a command.
-
-        Args:
-            model: The model from now on.
-            stamp: The time (ns).
-            state: The state.
-            command: The command.
-            target: The twist that it demands, within the limits of the model.
-            commanded_at: Time at which the command took effect (ns).
-        """
+        """Return the robot in a state, from now on following a command within the limits, `target`."""
         actuators = model.actuators
         if actuators is None or actuators.immediate:
             twist = target if actuators is None else actuators.reached(target, model)
@@ -463,46 +423,47 @@ class Robot:
             raise ValueError(f'stamp cannot go back from {self._stamp} ns to {stamp} ns')
         robot, expiry = self, self._expiry
         if expiry is not None and expiry <= stamp:
-            state = self._state(expiry)
+            state = self._state_at(expiry)
             robot = self._following(self._model, expiry, state, STANDSTILL, STANDSTILL, None)
-        return stamp, robot, robot._state(stamp)
+        return stamp, robot, robot._state_at(stamp)
 
-    def _state(self, stamp: int) -> _State:
+    def _state_at(self, stamp: int) -> _State:
         """Compute the state at a time up to the timeout."""
         ahead = self._ahead
         if ahead is not None and ahead[0] == stamp:
             return ahead[1]
         if self._drive is not None:
-            return self._driven(self._drive, stamp)
-        dt = (stamp - self.stamp) / NANOSECONDS
-        twist = v, omega = self.twist
-        truth, model = self._truth, self.model
+            state = self._driven(self._drive, stamp)
+            self._ahead = stamp, state
+            return state
+        dt = (stamp - self._stamp) / NANOSECONDS
+        (pose, angles, uncertainty, truth), twist, model = self._state, self._twist, self._model
         if dt == 0.0 or (truth is None and twist == STANDSTILL):
-            return self._present
+            return self._state
         L, k = model.wheel_separation, model.wheel_travel_variance
         if truth is not None:
-            truth = truth.after(self.stamp, stamp, twist, L, k)
+            truth = truth.after(self._stamp, stamp, twist, L, k)
         if twist == STANDSTILL:
-            return self.pose_tuple, self.wheel_angles, self._uncertainty, truth
-        (x, y, theta), (right, left) = self.pose_tuple, self.wheel_angles
-        omega_R, omega_L = self.wheel_speeds
+            return pose, angles, uncertainty, truth
+        (x, y, theta), (right, left), (v, omega) = pose, angles, twist
+        omega_R, omega_L = model.wheel_speeds(v, omega)
         right, left = angles = right + omega_R * dt, left + omega_L * dt
         # A finite sum has finite terms.
         if not (isfinite(right + left) or (isfinite(right) and isfinite(left))):
             raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
-        uncertainty = self._uncertainty.after((theta, twist, dt, L, k))
+        uncertainty = uncertainty.after((theta, twist, dt, L, k))
         state = arc_end(x, y, theta, v, omega, dt), angles, uncertainty, truth
         self._ahead = stamp, state
         return state
 
     def _driven(self, drive: Drive, stamp: int) -> _State:
         """Compute the state at a time up to the timeout, along a drive."""
-        model, truth = self._model, self._truth
+        model, truth = self._model, self._state[3]
         L, k = model.wheel_separation, model.wheel_travel_variance
         if truth is not None:
             truth = truth.along(drive.motion, self._stamp, stamp, L, k)
         time, end = drive.motion.seconds(self._stamp), drive.motion.seconds(stamp)
-        state = self._present
+        state = self._state
         if self._knot is not None and self._knot[0] <= end:
             time, state = self._knot
         for piece, limit in drive.motion.steps(time, end):
@@ -511,9 +472,7 @@ class Robot:
                 self._knot = time, state
             state, time = self._after(state, piece, L, k), limit
         pose, angles, uncertainty, _ = state
-        state = pose, angles, uncertainty, truth
-        self._ahead = stamp, state
-        return state
+        return pose, angles, uncertainty, truth
 
     def _after(self, state: _State, piece: Piece, L: float, k: float) -> _State:
         """Compute the state after a step of a drive; the truth is left out."""
@@ -527,7 +486,8 @@ class Robot:
             uncertainty = uncertainty.after((pose[2], twist, dt, L, k))
             pose = arc_end(*pose, v, omega, dt)
         else:
-            turned = self._model.wheel_speeds(*piece.path(dt))
+            _, _, path, turn = piece.state(dt)
+            turned = self._model.wheel_speeds(path, turn)
             uncertainty = uncertainty.after((pose[2], piece, dt, L, k))
             pose = displaced(pose, piece.displacement(dt))
         return pose, (right + turned[0], left + turned[1]), uncertainty, None
@@ -537,33 +497,18 @@ def _robot(
     model: RobotModel,
     stamp: int,
     state: _State,
-    command: tuple[float, float],
-    twist: tuple[float, float],
+    command: Twist,
+    twist: Twist,
     commanded_at: int | None = None,
     drive: Drive | None = None,
 ) -> Robot:
     """Return a robot with checked values, without checking them again for every message."""
     robot = object.__new__(Robot)
-    robot._model, robot._stamp = model, stamp
-    robot._pose, robot._wheel_angles, robot._uncertainty, robot._truth = state
-    robot._command, robot._twist, robot._commanded_at = command, twist, commanded_at
-    robot._expiry = _expiry(model, stamp, commanded_at)
-    robot._drive = drive
-    robot._ahead = robot._knot = None
+    robot._set(model, stamp, state, command, twist, commanded_at, drive)
     return robot
 
 
-def _expiry(model: RobotModel, stamp: int, commanded_at: int | None) -> int | None:
-    """Return the time at which the timeout stops a robot (ns), see `Robot.expiry`."""
-    timeout = model.command_timeout
-    if commanded_at is None or not timeout:
-        return None
-    # If the timeout was shortened, it expires now, not in the past.
-    expiry = commanded_at + timeout
-    return expiry if expiry > stamp else stamp
-
-
-def _triple(name: str, value: ArrayLike) -> tuple[float, float, float]:
+def _triple(name: str, value: ArrayLike) -> Pose:
     """Return three finite numbers as a tuple of floats.
 
     Raises:
@@ -573,7 +518,6 @@ def _triple(name: str, value: ArrayLike) -> tuple[float, float, float]:
     return x, y, theta
 
 
-def _truth(model: RobotModel, pose: Sequence[float]) -> Truth | None:
+def _truth(model: RobotModel, pose: Pose) -> Truth | None:
     """Return the truth of a robot whose pose is the true one; None: its model has no drift."""
-    x, y, theta = pose
-    return None if model.drift is None else Truth(model.drift, (x, y, theta))
+    return None if model.drift is None else Truth(model.drift, pose)

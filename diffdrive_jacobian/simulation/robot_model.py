@@ -14,11 +14,10 @@ from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_l
 from diffdrive_jacobian.numerics.checks import (
     NotNegative,
     Positive,
-    nanoseconds,
     numbers,
 )
 from diffdrive_jacobian.numerics.fields import Checked, instance, optional
-from diffdrive_jacobian.simulation.actuators import Actuators, Speeds
+from diffdrive_jacobian.simulation.actuators import Actuators, Duration, Speeds
 from diffdrive_jacobian.simulation.slip import Drift
 
 
@@ -28,14 +27,6 @@ def _limits(name: str, value: Any) -> VelocityLimits:
     if not limits.alike:
         raise ValueError(f'{name} must be numbers for one robot, got {limits}')
     return limits
-
-
-def _timeout(name: str, value: Any) -> int:
-    """Require a duration that is not negative (ns)."""
-    timeout = nanoseconds(name, value)
-    if timeout < 0:
-        raise ValueError(f'{name} must be zero or positive (ns), got {timeout}')
-    return timeout
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,7 +49,7 @@ class RobotModel(Checked):
     """Radius of the left wheel, relative to r [-]."""
     limits: Annotated[VelocityLimits, _limits] = field(default_factory=VelocityLimits)
     """Velocity limits; without limits the robot is an ideal unicycle."""
-    command_timeout: Annotated[int, _timeout] = 0
+    command_timeout: Duration = 0
     """Time after which the last command is replaced by zero (ns); 0: never."""
     wheel_travel_variance: NotNegative = 1e-5
     """k, variance of each wheel's travel per distance travelled (m)."""

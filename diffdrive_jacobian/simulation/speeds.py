@@ -30,6 +30,8 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 Course: TypeAlias = tuple[float, float, float]
 """a, b and c of a speed."""
+Pose: TypeAlias = tuple[float, float, float]
+"""`(x, y, theta)` (m, m, rad)."""
 Twist: TypeAlias = tuple[float, float]
 """`(v, omega)` (m/s, rad/s)."""
 MAX_TURN = 1.0
@@ -94,10 +96,6 @@ class Piece(NamedTuple):
     def twist(self, t: float) -> Twist:
         """Return the twist after the time t."""
         return speed_at(self.v, t, self.tau), speed_at(self.omega, t, self.tau)
-
-    def path(self, t: float) -> Twist:
-        """Return the distance travelled, forwards less backwards, and the turn, after the time t."""
-        return travelled(self.v, t, self.tau), travelled(self.omega, t, self.tau)
 
     def part(self, begin: float, end: float) -> Piece:
         """Return the piece from one time to another."""
