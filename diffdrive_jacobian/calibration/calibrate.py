@@ -107,9 +107,8 @@ class Calibration:
     def residuals(self) -> list[Array]:
         """Return what remains between the reference and the most likely poses of the sensor.
 
-        Returns:
-            For each continuous motion the time since the first pose of all (s) and the residual in x, y
-            (m) and heading (rad), shape (n, 4). Poses at rest are merged.
+        For each continuous motion the time since the first pose of all (s) and the residual in x, y (m)
+        and heading (rad), shape (n, 4). Poses at rest are merged.
         """
         parts: list[Array] = []
         begin = before = 0.0

@@ -105,14 +105,11 @@ def _ratio(correlations: Array) -> Array:
 
 
 def _correlations(ours: Array, theirs: Array) -> tuple[NDArray[np.int64], Array, Array]:
-    """Correlate the columns of two tables within their overlap.
-
-    Args:
-        ours: Shape (m, k).
-        theirs: Shape (n, k). Its row j meets row j + lag of the other one.
+    """Correlate the columns of two tables, shapes (m, k) and (n, k), within their overlap.
 
     Returns:
-        The lags, the numbers of rows that overlap, shapes (l,), and the correlations, shape (l, k).
+        The lags by which rows of the second are moved, the numbers of rows that overlap, shapes (l,), and
+        the correlations, shape (l, k).
     """
     m, n = len(ours), len(theirs)
     lags = np.arange(1 - n, m)

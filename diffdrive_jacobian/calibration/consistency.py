@@ -97,13 +97,7 @@ class Misfit:
 
 
 def misfit(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -> Misfit | None:
-    """Return the most certain misfit of an estimate; None: all differences may be chance.
-
-    Args:
-        segments: The motions with the poses `estimate.states`.
-        nominal: Nominal dimensions of the robot.
-        estimate: The most likely parameters.
-    """
+    """Return the most certain misfit at the most likely parameters; None: all may be chance."""
     segments, estimate = _thinned(segments, estimate)
     offsets = estimate.parameters[TIME_OFFSETS:]
     windows, members = _windows(segments, nominal, offsets)
@@ -164,12 +158,7 @@ def _local(
 ) -> tuple[Array, Array, Array]:
     """Return what is known of changes of the logarithms of the multipliers in single cells.
 
-    Args:
-        segments: The motions with the poses `estimate.states`.
-        nominal: Nominal dimensions of the robot.
-        estimate: The most likely parameters.
-        cells: Cells of each step of each motion, shape (n - 1, any).
-        number: Of all cells, n.
+    `cells` are those of each step of each motion, shape (n - 1, any), out of `number`.
 
     Returns:
         Their information, shape (n, 3, n, 3), their gradient, shape (n, 3), and the changes of the

@@ -59,16 +59,9 @@ def chosen_topic(
     *,
     any_name: bool = False,
 ) -> str:
-    """Return the topic with the wheels or with the reference.
+    """Return the topic that is given, or the only one of some types with the usual base name.
 
-    Args:
-        reader: An open bag.
-        given: The topic that the user chose; None: none.
-        option: The option with which it is chosen.
-        usual: Base name of the usual topic.
-        types: Allowed types.
-        any_name: Whether the only topic of these types is taken whatever its name, unless it is one of
-            `NO_REFERENCE`.
+    With `any_name` that may also be the only topic of these types, unless it is one of `NO_REFERENCE`.
 
     Raises:
         BagError: There is none or several, or the given one is missing or has another type.
@@ -395,18 +388,12 @@ class JointRows:
         return list(dict.fromkeys(name for names in self.layouts for name in names))
 
     def of(self, wheels: tuple[str, str], where: object, topic: str) -> tuple[Samples, bool]:
-        """Return the angles of the right and the left wheel, or their speeds if there are none.
+        """Return the angles of the right and the left wheel, or their speeds, and whether it is these.
 
-        Args:
-            wheels: Joints of the left and the right wheel.
-            where: The bag, for messages.
-            topic: The topic, for messages.
-
-        Returns:
-            The samples, and whether these are speeds.
+        `wheels` are the joints of the left and the right wheel.
 
         Raises:
-            BagError: There are fewer than two.
+            BagError: There are fewer than two of both.
         """
         left, right = wheels
         for are_speeds in (False, True):

@@ -49,12 +49,9 @@ def compared_distance(result: Calibration) -> float:
 
 
 def tracks(result: Calibration, geometry: Geometry, distance: float) -> list[Track]:
-    """Return the tracks of a calibration with given dimensions.
+    """Return the tracks of a calibration with given dimensions, and errors over a distance (m).
 
-    Args:
-        result: The calibration; its time offsets and its sensor are used.
-        geometry: Dimensions of the robot for the odometry.
-        distance: Distance for the errors (m).
+    Its time offsets and its sensor are used.
     """
     sensor = inverted(result.estimate.sensor)
     found = []
@@ -92,9 +89,7 @@ def rms(values: list[Array]) -> float:
 def parameter_file(result: Calibration, source: str) -> str:
     """Return a ROS parameter file (YAML) for the nodes of this package and for diff_drive_controller.
 
-    Args:
-        result: The calibration.
-        source: What it was estimated from, one line for a comment.
+    `source` says what it was estimated from, in one line for a comment.
     """
     deviations = np.sqrt(np.diag(result.covariance)).tolist()
     lines = [

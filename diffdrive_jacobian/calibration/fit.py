@@ -101,14 +101,9 @@ def fit(
     given: Given,
     anchor: Array | None = None,
 ) -> Estimate:
-    """Return the most likely parameters.
+    """Return the most likely parameters of continuous motions of at least two poses each.
 
-    Args:
-        segments: Continuous motions, each with at least two poses.
-        nominal: Nominal dimensions of the robot.
-        start: Approximate parameters and noise.
-        given: What of the noise is known.
-        anchor: Parameters about which the prior lies (default: those of `start`).
+    The prior lies about `anchor` (default: the parameters of `start`).
 
     Raises:
         CalibrationError: The estimate does not converge.
@@ -173,12 +168,7 @@ def score(
 ) -> tuple[Array, Array]:
     """Return the information and the gradient of all parameters and of further ones that are 0.
 
-    Args:
-        segments: Motions with the poses `estimate.states`.
-        nominal: Nominal dimensions.
-        estimate: Parameters, poses and noise.
-        columns: As of `linearized`.
-        count: Number of all parameters.
+    `columns` and `count` are as of `linearized`.
 
     Returns:
         Fisher information, shape (count, count), and gradient, shape (count,), without the prior.
@@ -348,15 +338,12 @@ def _used(
 
 
 def solve_block_tridiagonal(diagonal: Array, upper: Array, right: Array) -> tuple[Array, float]:
-    """Solve `A x = b` and compute log det A.
+    """Solve `A x = b` and compute log det A, infinite or NaN where A is singular.
 
     Args:
         diagonal: Blocks A[i, i], shape (n, 3, 3).
         upper: Blocks A[i, i + 1], shape (n - 1, 3, 3).
-        right: b, shape (n, 3, m); m may be 0.
-
-    Returns:
-        x, shape (n, 3, m), and log det A. It is infinite or NaN where A is singular.
+        right: b, shape (n, 3, m), as x; m may be 0.
 
     Raises:
         numpy.linalg.LinAlgError: A block is exactly singular.
@@ -435,14 +422,8 @@ def linearized(
     And how far the reading errors of both wheels, each of one standard deviation, seem to move the body
     at each pose: twists in its frame, shape (n, 3, 2).
 
-    Args:
-        segments: Continuous motions.
-        nominal: Nominal dimensions.
-        estimate: Parameters and poses at which they are linearized.
-        window: As of `increments`.
-        columns: Where, among all parameters, changes of the logarithms of the multipliers begin that are
-            those of single steps, shape (n - 1, any) for each motion (default: there are none).
-        count: Number of all parameters (default: those of the estimate).
+    `columns` are where, among `count` parameters in all, changes of the logarithms of the multipliers
+    begin that are those of single steps, shape (n - 1, any) for each motion (default: there are none).
     """
     count = count or len(estimate.parameters)
     if columns is None:

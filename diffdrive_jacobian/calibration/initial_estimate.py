@@ -51,11 +51,9 @@ class InitialEstimate:
     """Pose of the sensor in the body frame, shape (3,)."""
 
     def differences(self, segment: Segment, time_offset: float) -> tuple[Array, Array]:
-        """Return what differs between poses of the reference and the wheels.
+        """Return the steps of the reference relative to those that the wheels measure, shape (n - 1, 3).
 
-        Returns:
-            The poses in the frames of the poses before, relative to those that the wheels measure,
-            shape (n - 1, 3), and the distance that both wheels travel between them, shape (n - 1,).
+        And the distance that both wheels travel in each step, shape (n - 1,).
         """
         moved = _moved(segment, self.geometry, time_offset)
         expected = composed(composed(inverted(self.sensor), moved.steps), self.sensor)
@@ -70,12 +68,7 @@ def _moved(segment: Segment, geometry: Geometry, offset: float) -> Increments:
 
 
 def initial_estimate(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> InitialEstimate:
-    """Return approximate parameters.
-
-    Args:
-        segments: Continuous motions.
-        nominal: Nominal dimensions.
-        offsets: Time offset of each recording (s).
+    """Return approximate parameters from continuous motions and the time offset of each recording (s).
 
     Raises:
         CalibrationError: The wheels or the reference do not move, or turn in opposite senses.
@@ -197,14 +190,9 @@ def _positions(segment: Segment, geometry: Geometry, offset: float) -> tuple[Arr
 def _robust(
     A: Array, b: Array, prior: Sequence[float], deviations: Sequence[float], noise: float
 ) -> tuple[Array, float]:
-    """Return the least-squares solution without outliers (Tukey), and the scale of the errors.
+    """Return the least-squares solution of `A x = b` without outliers (Tukey).
 
-    Args:
-        A: Shape (n, m).
-        b: Shape (n,).
-        prior: Solution where the equations do not determine it.
-        deviations: How far it may be from that.
-        noise: Standard deviation of the equations for the weight of the prior, and the least scale.
+    `noise` is the standard deviation of the equations for the weight of the prior, and the least scale.
     """
     ridge = np.diag(noise**2 / np.square(deviations))
     target = ridge @ np.asarray(prior)

@@ -40,13 +40,9 @@ PERIOD = 0.025
 def located(time: Array, readings: Array) -> tuple[Array, Array]:
     """Return the angles of a wheel at the times of its readings, and their standard deviations.
 
-    Both have shape (m,). Readings that change with each sample are returned as they are. The deviation
-    is 0 where the wheel is located between two changes of its reading. Elsewhere, also where the reading
-    changes with each sample, it is that of a step, if the readings show one.
-
-    Args:
-        time: Increasing, shape (m,) (s).
-        readings: Shape (m,) (rad).
+    Readings that change with each sample are returned as they are. The deviation is 0 where the wheel is
+    located between two changes of its reading. Elsewhere, also where the reading changes with each
+    sample, it is that of a step, if the readings show one.
     """
     changes = np.flatnonzero(np.diff(readings))
     first, last = np.append(0, changes + 1), np.append(changes, len(time) - 1)
@@ -74,12 +70,7 @@ def located(time: Array, readings: Array) -> tuple[Array, Array]:
 
 
 def densified(time: Array, angles: Array) -> tuple[Array, Array]:
-    """Return times at most about `PERIOD` apart and the angles there, by monotone cubic interpolation.
-
-    Args:
-        time: Increasing, shape (m,), m at least 2 (s).
-        angles: Shape (m, 2) (rad).
-    """
+    """Return times at most about `PERIOD` apart and angles there, by monotone cubic interpolation."""
     parts = max(1, int(np.ceil(float(np.median(np.diff(time))) / PERIOD - 1e-6)))
     h = np.diff(time)[:, None]
     speed = np.diff(angles, axis=0) / h
@@ -169,12 +160,8 @@ def overlapping(
 ) -> list[Segment]:
     """Return the continuous motions of a recording: its times in common, split at gaps of the wheels.
 
-    Args:
-        recording: The recording.
-        index: Its index among all.
-        offset: What is added to the times of its poses (s).
-        radius: Nominal wheel radius (m).
-        smooth: Whether the speeds of wheels change gradually between samples; else they are constant.
+    `offset` is added to the times of its poses (s). If `smooth`, the speeds of wheels change gradually
+    between samples; else they are constant.
 
     Raises:
         CalibrationError: There is no time in common.
@@ -293,10 +280,7 @@ def without(segments: Sequence[Segment], recording: int, begin: float, end: floa
 def without_jumps(
     segments: Sequence[Segment], found: InitialEstimate, offsets: Array, names: Sequence[str]
 ) -> tuple[list[Segment], list[str]]:
-    """Remove glitches of the reference, and split motions at its jumps.
-
-    Returns:
-        The motions, and descriptions of what was found.
+    """Remove glitches of the reference, split motions at its jumps, and return notes of them.
 
     Raises:
         CalibrationError: There are too many of them, or too few poses remain.

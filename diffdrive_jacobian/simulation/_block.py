@@ -177,12 +177,7 @@ class Block:
     """Some robots of a batch and their current states."""
 
     def __init__(self, batch: Batch, rows: Rows) -> None:
-        """Place the robots at their starts.
-
-        Args:
-            batch: The batch of these robots alone.
-            rows: Their indices in the whole batch.
-        """
+        """Place the robots of a batch at their starts. `rows` are their indices in the whole one."""
         self.batch, self.rows, count = batch, rows, len(rows)
         self.x, self.y, theta = batch.starts.T.copy()
         self.theta: Array = wrap(theta)
@@ -211,14 +206,9 @@ class Block:
     def drive(
         self, keep: Keep | None, on_step: Callable[[], object] | None = None
     ) -> Iterator[tuple[Rows, Outcomes]]:
-        """Drive the robots until each has arrived or is given up.
+        """Drive the robots until each has arrived or is given up. Yield finished rows and their outcomes.
 
-        Args:
-            keep: Called with every sample of every robot; None: samples are not kept.
-            on_step: Called at the beginning of every step.
-
-        Yields:
-            The rows that are finished, and their outcomes.
+        `keep` is called with every sample of every robot, `on_step` at the beginning of every step.
         """
         batch = self.batch
         for step in range(batch.steps + 1):

@@ -72,12 +72,7 @@ class Follower:
         self._take(self.demanded[:, going], self.twist[:, going])
 
     def steps(self, r: Any, L: Any, command: Array) -> Iterator[tuple[Rows, Array, Array]]:
-        """Let the robots drive until the next sample.
-
-        Args:
-            r: Wheel radius, one for all or that of each robot (m).
-            L: Wheel separation, likewise (m).
-            command: Their twists that are commanded now.
+        """Let the robots, of wheel radii r and separations L, drive until the next sample.
 
         Yields:
             For some of the robots what one step adds: the displacement in the body frame,

@@ -38,18 +38,9 @@ MAX_NOISE = 0.25
 def moments_along(
     moments: Entries, theta: float, piece: Piece, dt: float, L: float, k: float
 ) -> Entries | None:
-    """Propagate the moments of the error along a step of a motion, exactly.
+    """Return the moments of the error after a step of the quadrature of a duration; None: they overflow.
 
-    Args:
-        moments: Moments at the start.
-        theta: Reported heading at the start (rad).
-        piece: The twist as reported, at most a step of the quadrature.
-        dt: Its duration (s).
-        L: Wheel separation (m).
-        k: Variance per distance travelled of each wheel (m).
-
-    Returns:
-        The moments. None: they overflow.
+    `theta` is the heading at the start (rad), L the wheel separation (m), k as of `odometry_noise` (m).
     """
     right, left = _rims(piece, L)
     turns = (*sign_changes(right, dt, piece.tau), *sign_changes(left, dt, piece.tau))

@@ -110,17 +110,13 @@ class AccelerationLimits(Checked):
     def transition(
         self, start: Twist, target: Twist, wheel_speeds: Callable[[float, float], Twist]
     ) -> Iterator[tuple[float, Twist]]:
-        """Return the fastest transition along the straight line from one twist to another.
+        """Yield the parts of the fastest transition along the straight line from one twist to another.
 
-        Args:
-            start: The twist at the beginning.
-            target: The twist at the end.
-            wheel_speeds: Maps a twist to the wheel speeds (rad/s), linearly.
+        `wheel_speeds` maps a twist to the wheel speeds (rad/s), linearly.
 
         Yields:
-            The duration of each part (s), not zero, and the twist at its end. Within a part both speeds
-            are linear in time. Nothing, if the target is reached at once. A jump, where there is no
-            limit, is a part of no duration, and so is what takes less than `SHORTEST`.
+            The duration of each part, and the twist at its end. Within a part both speeds are linear in
+            time. A jump, where there is no limit, and what takes less than `SHORTEST` have no duration.
         """
         (v, omega), dv, domega = start, target[0] - start[0], target[1] - start[1]
         wheels = max(map(abs, wheel_speeds(dv, domega)))
@@ -227,11 +223,9 @@ class Actuators(Checked):
         )
 
     def rolled(self, twist: Twist, wheels: Wheels | None = None) -> Twist:
-        """Return the distance and the turn from when zero is commanded until the robot is at rest.
+        """Return the distance and the turn from when zero is commanded, after a held twist, to rest.
 
-        Args:
-            twist: The twist before, held for long enough.
-            wheels: The wheels; None: the limit of their acceleration is left out.
+        Without `wheels` the limit of their acceleration is left out.
         """
         seconds = self.reaction + self._deceleration_time(twist, wheels) / 2.0
         v, omega = twist
@@ -248,8 +242,7 @@ class Actuators(Checked):
             twist: The twist.
             room: The distance and the turn, zero or positive; infinite: any (m, rad).
             period: Time for which the twist is held before the next one (s).
-            coming: Distance and turn by commands that are under way, as the delay lets them be. None: as
-                if all were this twist.
+            coming: Distance and turn by commands that are delayed; None: as if all were this twist.
         """
         reaction, stop = self.reaction + period, self._deceleration_time(twist, None)
         if coming is not None:
@@ -297,16 +290,10 @@ class Drive(NamedTuple):
         return cls(constant, constant)
 
     def followed(self, stamp: int, target: Twist, actuators: Actuators, wheels: Wheels) -> Drive:
-        """Return how the speeds go on from a time when another twist is to be reached.
+        """Return how the speeds go on from a time (ns) when another target is to be reached.
 
         The motors may differ from those so far: their largest speeds and their lag are the new ones at
         once, the limits of the acceleration after the delay, with the target.
-
-        Args:
-            stamp: The time (ns).
-            target: The twist, within the limits of the velocity.
-            actuators: The motors from now on.
-            wheels: The wheels from now on.
         """
         now = self.demanded.seconds(stamp)
         then = self.demanded.seconds(stamp + actuators.delay)

@@ -68,19 +68,8 @@ def short_arc(alpha: float, turn: float, nu: float, beta: float, m: float) -> tu
     """Compute the moments of an arc between two messages, by the first terms of their series.
 
     All terms above 2e-14 of the standard deviations of position and heading are there, for a turn and an
-    m of at most `SHORT_TURN` and `SHORT_NOISE`. In the frame of the chord and about the mean there are
-    half as many as in other frames.
-
-    Args:
-        alpha: v t (m).
-        turn: omega t (rad).
-        nu: vv t (m^2).
-        beta: vw t (m rad), at most `sqrt(2 m nu)`.
-        m: ww t / 2.
-
-    Returns:
-        The entries of `central` moments, but in the frame of the chord, turned by `turn / 2` from that
-        of the reported pose at the start.
+    m of at most `SHORT_TURN` and `SHORT_NOISE`. They are `central`, in the frame of the chord, turned by
+    `turn / 2` from that of the reported pose at the start, where there are half as many as in others.
     """
     s, a, b = turn * turn, alpha * m, beta * turn
     at, bm, am = a * turn, b * m, a * m
@@ -127,27 +116,14 @@ def short_arc(alpha: float, turn: float, nu: float, beta: float, m: float) -> tu
 
 
 def central(noise: NoiseMoments, m: float) -> tuple[float, ...]:
-    """Return the mean, and the other moments about the mean, in the order of `NoiseMoments`.
-
-    Args:
-        noise: The moments.
-        m: ww t / 2, for which they were computed.
-    """
+    """Return the mean, and the other moments about the mean, in the order of `NoiseMoments`."""
     x, y, xx, xy, yy, xt, yt, xc, xs, yc, ys = noise
     loss = math.expm1(-m)
     return x, y, xx - x * x, xy - x * y, yy - y * y, xt, yt, xc - x * loss, xs, yc - y * loss, ys
 
 
 def series(alpha: float, turn: float, nu: float, beta: float, m: float) -> NoiseMoments:
-    """Compute the moments by their power series in time, for an arc up to `RADIUS`.
-
-    Args:
-        alpha: v t (m).
-        turn: omega t (rad).
-        nu: vv t (m^2).
-        beta: vw t (m rad).
-        m: ww t / 2.
-    """
+    """Compute the moments by their power series in time, for an arc up to `RADIUS`."""
     x, half = 1j * turn, 0.5j * beta
     drift, ahead = alpha + half, alpha + 3.0 * half
     # Terms of t^n: of exp(-m t) - 1 and exp(-4 m t) - 1, then of the moments E[gamma], E[gamma psi],
@@ -305,11 +281,7 @@ def propagated_moments(
     L: float,
     wheel_travel_variance: float,
 ) -> Entries | None:
-    """Compute what `propagate_moments` returns for values that were checked before.
-
-    Returns:
-        The moments. None: they overflow.
-    """
+    """Return `propagate_moments` of values that were checked; None: they overflow."""
     v, omega = twist
     try:
         vv, vw, ww = spectral_densities(v, omega, L, wheel_travel_variance)
@@ -376,15 +348,8 @@ def composed(
     the error becomes `e + (u - 1) g + u gamma`. The noise is independent of e and delta. Its mean p
     lengthens the displacement: with `h = g + p` the error is `e + p + (u - 1) h + u (gamma - p)`.
 
-    Args:
-        moments: Entries of `Moments` at the start.
-        cosine: Direction in the world of the x axis of the frame of the noise.
-        sine: Likewise.
-        gx: Displacement in the world (m).
-        gy: Likewise.
-        m: Half the variance of the error of the heading that the arc adds.
-        noise: The mean of the noise in that frame, and the moments about it, in the order of
-            `NoiseMoments`; None: there is no noise.
+    `cosine` and `sine` are the direction in the world of the x axis of the frame of the noise, of which
+    there are `central` moments, or None.
     """
     xx, xy, xt, yy, yt, tt, x, y, xc, xs, yc, ys = moments
     # E[C], E[cos delta], E[C^2], E[S^2], E[cos delta C]; E[S], E[C S] are zero.

@@ -137,8 +137,7 @@ def covariance_of_pose(name: str, covariance: ArrayLike) -> NDArray[np.float64]:
     """Return the covariance of one pose as an array, shape (3, 3).
 
     Raises:
-        ValueError: The shape is another one, an entry is not finite, or the matrix is not symmetric and
-            positive semidefinite up to rounding.
+        ValueError: The shape, an entry that is not finite, or not symmetric and positive semidefinite.
     """
     made = array(name, covariance, 3, 3)
     if made.ndim != 2:

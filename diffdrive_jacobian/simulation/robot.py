@@ -316,11 +316,6 @@ class Robot:
     def reported(self, pose: Pose, wheel_angles: Speeds, twist: Twist) -> Robot:
         """Return this robot as its sensors report it, with the same covariance and the same truth.
 
-        Args:
-            pose: `(x, y, theta)` of the odometry, finite (m, m, rad).
-            wheel_angles: `(right, left)`, finite (rad).
-            twist: `(v, omega)`, finite (m/s, rad/s).
-
         Raises:
             ValueError: An argument has another shape or is not finite.
         """

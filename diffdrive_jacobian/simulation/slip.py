@@ -76,8 +76,8 @@ class Drift(Checked):
 class Truth:
     """The true pose of a robot, at the time of the `Robot` that has it. An immutable value to its users.
 
-    The methods take the motion as the odometry has it: the nominal twist `(v, omega)` that is held, the
-    nominal wheel separation L (m) and k (m). All values were checked before.
+    The methods take the motion as the odometry has it: the nominal twist `(v, omega)`, the nominal wheel
+    separation L (m), and k (m). All values were checked before.
     """
 
     __slots__ = ('_ahead', '_drift', '_held', '_slipped', 'pose')
@@ -91,11 +91,8 @@ class Truth:
     ) -> None:
         """Place the robot.
 
-        Args:
-            drift: In what its motion differs from its odometry.
-            pose: `(x, y, theta)` (m, m, rad).
-            slipped: What its wheels slipped in the present cell; None: it begins, or they rested in it.
-            held: The twist that led here, and since when it is held (ns); None: the robot rested.
+        `slipped` is what its wheels slipped in the present cell; None: it begins, or they rested in it.
+        `held` is the twist that led here, and since when (ns); None: the robot rested.
         """
         self.pose = pose
         self._drift = drift
@@ -117,14 +114,7 @@ class Truth:
         return self if self._held is None else Truth(self._drift, self.pose)
 
     def after(self, start: int, stamp: int, twist: tuple[float, float], L: float, k: float) -> Truth:
-        """Return the truth after a motion.
-
-        Args:
-            start: Time of this value (ns).
-            stamp: A later time (ns).
-            twist: The nominal twist from `start` to `stamp`.
-            L: Nominal wheel separation (m).
-            k: Variance of each wheel's travel per distance (m).
+        """Return the truth after a nominal twist from `start`, the time of this value, to `stamp` (ns).
 
         Raises:
             ValueError: The motion overflows.
@@ -164,17 +154,10 @@ class Truth:
         return Truth(drift, pose, slipped, (twist, since))
 
     def along(self, motion: Profile, begin: int, end: int, L: float, k: float) -> Truth:
-        """Return the truth after a motion whose speeds change with time.
+        """Return the truth after a nominal motion whose speeds change, from `begin`, now, to `end` (ns).
 
         In a cell a wheel slips at a constant speed from one piece of the motion to the next, such that
         at the end of the piece what was slipped has the variance of the distance so far.
-
-        Args:
-            motion: The nominal twist.
-            begin: Time of this value (ns).
-            end: A later time (ns).
-            L: Nominal wheel separation (m).
-            k: Variance of each wheel's travel per distance (m).
 
         Raises:
             ValueError: The motion overflows.
@@ -194,13 +177,13 @@ class Truth:
         return here.after(settled, end, motion.final, L, k) if end > settled else here
 
     def twist_along(self, motion: Profile, stamp: int, L: float, k: float) -> tuple[float, float]:
-        """Return the true twist from a time on in such a motion, with the arguments of `along`."""
+        """Return the true twist from a time (ns) on in such a motion."""
         wheels, _, _ = next(self._slipping(motion, stamp, L, k))
         right, left = wheels.twist(0.0)
         return (right + left) / 2.0, (right - left) / (L * self._drift.wheel_separation_multiplier)
 
     def _in_cell(self, motion: Profile, begin: int, end: int, L: float, k: float) -> Truth:
-        """Return the truth after a part of a cell, with the arguments of `along`."""
+        """Return the truth after a part of a cell."""
         pose, slipped, cell = self.pose, None, begin // CELL
         separation = L * self._drift.wheel_separation_multiplier
         time, last = motion.seconds(begin), motion.seconds(end)
@@ -224,11 +207,10 @@ class Truth:
     def _slipping(
         self, motion: Profile, begin: int, L: float, k: float
     ) -> Iterator[tuple[Piece, Piece, tuple[float, float, float, float, float, float]]]:
-        """Yield the pieces from a time to the end of its cell.
+        """Yield the pieces from a time (ns) to the end of its cell.
 
-        Yields:
-            The speeds of the true rims of right and left wheel, with and without the slip; a, V and the
-            slip for xi = 1 of the right wheel, then of the left one, at the beginning of the piece.
+        Each is the speeds of the true rims of right and left wheel, with and without the slip, and a, V
+        and the slip for xi = 1 of the right wheel, then of the left one, at its beginning.
         """
         drift, cell = self._drift, begin // CELL
         slips = drift.seed is not None and k > 0.0
@@ -253,14 +235,7 @@ class Truth:
                 a_R, V_R, a_L, V_L = math.sqrt(grown_R), grown_R, math.sqrt(grown_L), grown_L
 
     def twist(self, stamp: int, twist: tuple[float, float], L: float, k: float) -> tuple[float, float]:
-        """Return the true twist from a time on, the slip included (m/s, rad/s).
-
-        Args:
-            stamp: Time of this value (ns).
-            twist: The nominal twist from then on.
-            L: Nominal wheel separation (m).
-            k: Variance of each wheel's travel per distance (m).
-        """
+        """Return the true twist, the slip included, while a nominal one is held from a time (ns) on."""
         right, left, separation = self._wheels(twist, L)
         seed = self._drift.seed
         if seed is not None and k:
@@ -305,13 +280,9 @@ def _fresh(time: int, held: int) -> _Slipped:
 
 
 def _gain(a: float, variance: float, growth: float, rest: float) -> float:
-    """Return the slip speed for xi = 1 in the rest of a cell (m/s).
+    """Return the slip speed for xi = 1 in the rest of a cell (s), as in the module's equation (m/s).
 
-    Args:
-        a: Distance slipped so far in the cell for xi = 1 (m).
-        variance: Variance of the slip that belongs to the distance so far (m^2).
-        growth: Its rate, `k |v|` (m^2/s).
-        rest: Time that is left of the cell (s).
+    The variance of the slip so far grows by `growth = k |v|` (m^2/s).
     """
     return (math.sqrt(variance + growth * rest) - a) / rest
 
@@ -319,10 +290,7 @@ def _gain(a: float, variance: float, growth: float, rest: float) -> float:
 def normals(seed: int, level: int, cell: int) -> tuple[float, float]:
     """Return the standard normal numbers of the right and the left wheel in a cell.
 
-    Args:
-        seed: The seed, from 0 to `MAX_SEED`.
-        level: The width of the cell is `CELL << level`.
-        cell: Index of the cell, its start divided by its width.
+    Its width is `CELL << level`, and its start is `cell` times that.
     """
     block, place = divmod(cell, _BLOCK)
     return _block(seed, level, block)[place]

@@ -210,11 +210,9 @@ class Profile:
         return found
 
     def steps(self, begin: float, end: float) -> Iterator[tuple[Piece, float]]:
-        """Yield the motion between two times in steps that are short enough for one quadrature.
+        """Yield the motion between two times (s) in steps that are short enough for one quadrature.
 
-        Yields:
-            The piece from the beginning of the step on, with the duration of the step, and the time at
-            its end (s).
+        Each is a piece that begins with the step and lasts as long, and the time at its end (s).
         """
         index = bisect_right(self.begins, begin) - 1
         while begin < end:
@@ -298,10 +296,7 @@ def rolled(course: Course, piece: Piece, seconds: float) -> float:
 def arc_end(
     x: float, y: float, theta: float, v: float, omega: float, dt: float
 ) -> tuple[float, float, float]:
-    """Compute `se2.integrate` for one pose, from floats that are finite.
-
-    Returns:
-        `(x, y, theta)` at the end.
+    """Return the pose `se2.integrate` of finite floats, for what runs with every message.
 
     Raises:
         ValueError: The result overflows.
