@@ -12,6 +12,7 @@ from diffdrive_jacobian.calibration.consistency import misfit
 from diffdrive_jacobian.calibration.fit import fit
 from diffdrive_jacobian.calibration.initial_estimate import initial_estimate, unit
 from diffdrive_jacobian.calibration.model import (
+    LEVER_ARM,
     TIME_OFFSETS,
     UNDETERMINED,
     YAW_OFFSET,
@@ -158,13 +159,12 @@ def calibrate(
             errors.append(error)
     if not found:
         raise errors[0]
-    return found[0] if len(found) == 1 else _compared(found[0], found[1], period)
+    return found[0] if len(found) == 1 else _compared(found, period)
 
 
-def _compared(first: Calibration, second: Calibration, period: float) -> Calibration:
+def _compared(found: list[Calibration], period: float) -> Calibration:
     """Return the more likely one of two results, with their difference in its uncertainty."""
-    if _misfit(second.estimate.noise) < _misfit(first.estimate.noise):
-        first, second = second, first
+    first, second = sorted(found, key=_misfit)
     difference = second.estimate.parameters - first.estimate.parameters
     deviations = np.sqrt(np.diag(first.estimate.covariance())[:3])
     if (np.abs(difference[:3]) < deviations).all():
@@ -177,8 +177,9 @@ def _compared(first: Calibration, second: Calibration, period: float) -> Calibra
     return replace(first, estimate=widened, notes=(*first.notes, note))
 
 
-def _misfit(noise: Noise) -> float:
+def _misfit(result: Calibration) -> float:
     """Return what falls with the likelihood of the noise, of three residuals of wheels for each pose."""
+    noise = result.estimate.noise
     return float(3.0 * np.log(noise.wheel) / 2.0 + 2.0 * np.log(noise.position) + np.log(noise.heading))
 
 
@@ -210,17 +211,14 @@ def _calibrated(
     segments, thinned = thinned_poses(segments)
     notes += [*found_notes, thinned] if thinned else found_notes
     first = initial_estimate(segments, nominal, offsets)
-    sensor = first.sensor.copy()
+    parameters = np.concatenate([np.log(first.geometry.multipliers), first.sensor, offsets])
+    free = np.ones(len(parameters), dtype=bool)
     if given.lever_arm is not None:
-        sensor[:2] = given.lever_arm
+        parameters[LEVER_ARM], free[LEVER_ARM] = given.lever_arm, False
     if given.yaw_offset is not None:
-        sensor[2] = given.yaw_offset
-    start = Estimate(
-        parameters=np.concatenate([np.log(first.geometry.multipliers), sensor, offsets]),
-        noise=START,
-        free=_free(given, len(recordings)),
-        information=np.zeros((0, 0)),
-    )
+        parameters[YAW_OFFSET], free[YAW_OFFSET] = given.yaw_offset, False
+    free[TIME_OFFSETS:] = given.time_offset is None
+    start = Estimate(parameters=parameters, noise=START, free=free, information=np.zeros((0, 0)))
     segments, motions, estimate, misfits = _consistent(segments, nominal, start, given, names)
     result = Calibration(
         nominal=nominal,
@@ -229,8 +227,7 @@ def _calibrated(
         segments=tuple(segments),
         motions=tuple(motions),
     )
-    _check_result(result)
-    notes += [*misfits, *_noise_notes(estimate.noise), *_size_notes(result, given)]
+    notes += [*misfits, *_judged(result, given)]
     correlation = _correlation(result)
     if correlation > CORRELATED:
         notes.append(
@@ -262,32 +259,46 @@ def _check(one: CalibrationDrive) -> None:
             raise CalibrationError(f'{one.name}: the times of {what} must increase')
 
 
-def _noise_notes(noise: Noise) -> list[str]:
+def _judged(result: Calibration, given: Given) -> list[str]:
+    """Return what is notable about the multipliers, the noise and the sensor.
+
+    Raises:
+        CalibrationError: They cannot be those of a robot and its reference.
+    """
+    values, noise = result.multipliers, result.estimate.noise
+    other_unit = unit(float(np.exp(np.log(values).mean())))
+    if (values < BOUNDS[0]).any() or (values > BOUNDS[1]).any():
+        found = ', '.join(f'{value:.3g}' for value in values.tolist())
+        raise CalibrationError(
+            f'multipliers must be from {BOUNDS[0]:g} to {BOUNDS[1]:g}, got {found} (left, right, '
+            'separation): are the nominal dimensions wrong, or is the reference of another robot, or in '
+            f'{other_unit} instead of metres?'
+        )
+    apart = f'{noise.wheel**0.5:.2g} m'
+    if noise.wheel > LARGE_WHEEL_NOISE:
+        raise CalibrationError(
+            f'the reference does not follow the wheels: after 1 m they differ by {apart}; is it of this '
+            'robot, and do the wheels slip?'
+        )
+    notes = []
     if noise.wheel < EXACT.wheel and noise.position < EXACT.position and noise.heading < EXACT.heading:
-        return [
+        notes.append(
             'the reference follows the wheels without error: it is simulated without slip, or odometry '
             'that was computed from these wheels, which does not show their true dimensions'
-        ]
+        )
     if noise.wheel > NOTABLE_WHEEL_NOISE:
-        return [
-            f'the wheels differ from the reference by {noise.wheel**0.5:.2g} m after 1 m: they slip, a '
-            'clock drifts, or the reference is of another body'
-        ]
-    return []
-
-
-def _size_notes(result: Calibration, given: Given) -> list[str]:
-    notes = []
-    values = result.multipliers
+        notes.append(
+            f'the wheels differ from the reference by {apart} after 1 m: they slip, a clock drifts, or '
+            'the reference is of another body'
+        )
     if (np.abs(np.log(values)) > np.log(UNUSUAL)).any():
         listed = ', '.join(f'{value:.4g}' for value in values.tolist())
         notes.append(
             f'the multipliers {listed} (left, right, separation) are beyond what manufacturing '
-            'explains: are the nominal dimensions wrong, or is the reference in '
-            f'{unit(float(np.exp(np.log(values).mean())))} instead of metres?'
+            f'explains: are the nominal dimensions wrong, or is the reference in {other_unit} instead '
+            'of metres?'
         )
-    yaw = float(result.estimate.sensor[2])
-    if given.yaw_offset is None and np.cos(yaw) < -np.cos(BACKWARD):
+    if given.yaw_offset is None and np.cos(result.estimate.sensor[2]) < -np.cos(BACKWARD):
         notes.append(
             'the sensor looks backwards. If it is not mounted so, the left and the right wheel are '
             'swapped and both turn in the wrong sense: the multipliers of the radii are exchanged then'
@@ -307,14 +318,6 @@ def _correlation(result: Calibration) -> float:
     if len(a) < LEAST_ERRORS:
         return 0.0
     return float(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), 0.0, 0.99))
-
-
-def _free(given: Given, count: int) -> np.typing.NDArray[np.bool_]:
-    free = np.ones(TIME_OFFSETS + count, dtype=bool)
-    free[3:5] = given.lever_arm is None
-    free[YAW_OFFSET] = given.yaw_offset is None
-    free[TIME_OFFSETS:] = given.time_offset is None
-    return free
 
 
 def _estimated(
@@ -384,20 +387,3 @@ def _consistent(
         f'{where}. Which is right is unknown: the estimate lies between, and its deviations include both'
     )
     return segments, motions, widened, notes
-
-
-def _check_result(result: Calibration) -> None:
-    values = result.multipliers
-    if (values < BOUNDS[0]).any() or (values > BOUNDS[1]).any():
-        found = ', '.join(f'{value:.3g}' for value in values.tolist())
-        raise CalibrationError(
-            f'multipliers must be from {BOUNDS[0]:g} to {BOUNDS[1]:g}, got {found} (left, right, '
-            'separation): are the nominal dimensions wrong, or is the reference of another robot, or in '
-            f'{unit(float(np.exp(np.log(values).mean())))} instead of metres?'
-        )
-    noise = result.estimate.noise
-    if noise.wheel > LARGE_WHEEL_NOISE:
-        raise CalibrationError(
-            f'the reference does not follow the wheels: after 1 m they differ by '
-            f'{noise.wheel**0.5:.2g} m; is it of this robot, and do the wheels slip?'
-        )

@@ -108,8 +108,8 @@ def _correlations(ours: Array, theirs: Array) -> tuple[NDArray[np.int64], Array,
     """Correlate the columns of two tables, shapes (m, k) and (n, k), within their overlap.
 
     Returns:
-        The lags by which rows of the second are moved, the numbers of rows that overlap, shapes (l,), and
-        the correlations, shape (l, k).
+        The lags by which rows of the second are moved, the numbers of rows that overlap, shapes (l,),
+        and the correlations, shape (l, k).
     """
     m, n = len(ours), len(theirs)
     lags = np.arange(1 - n, m)

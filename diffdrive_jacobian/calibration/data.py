@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bag_reader import (
@@ -46,252 +45,6 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 __all__ = ['WheelsAndReference', 'read_wheels_and_reference']
 
-NO_REFERENCE = ('odom', 'goal_pose', 'initialpose', 'start_pose')
-"""Topics that are no reference unless they are chosen: odometry is computed from the wheels."""
-
-
-def chosen_topic(
-    reader: Reader,
-    given: str | None,
-    option: str,
-    usual: str,
-    types: Sequence[str],
-    *,
-    any_name: bool = False,
-) -> str:
-    """Return the topic that is given, or the only one of some types with the usual base name.
-
-    With `any_name` that may also be the only topic of these types, unless it is one of `NO_REFERENCE`.
-
-    Raises:
-        BagError: There is none or several, or the given one is missing or has another type.
-    """
-    where = printable(reader.path, PATH_LIMIT)
-    fitting = [one for one in reader.connections if one.msgtype in types]
-    candidates = sorted({one.topic for one in fitting})
-    allowed = ' or '.join(types)
-    if given is not None:
-        topic = given if given.startswith('/') else f'/{given}'
-        if topic in candidates:
-            return topic
-        others = sorted({one.msgtype for one in reader.connections if one.topic == topic})
-        if others:
-            raise BagError(f'{where}: {topic} must be of type {allowed}, got {", ".join(others)}')
-        raise BagError(f'{where} has no topic {topic}; it has {_listed(reader.connections)}')
-    named = [topic for topic in candidates if base_name(topic) == usual]
-    if not named and any_name:
-        named = [topic for topic in candidates if base_name(topic) not in NO_REFERENCE]
-    if len(named) == 1:
-        return named[0]
-    if not named:
-        hint = f' (choose one with {option})' if candidates else ''
-        raise BagError(
-            f'{where} has no topic {usual} of type {allowed}; it has {_listed(reader.connections)}{hint}'
-        )
-    raise BagError(f'{where} has several such topics, {", ".join(named)}: choose one with {option}')
-
-
-def _listed(connections: Sequence[Connection]) -> str:
-    found = sorted({f'{printable(one.topic)} ({printable(one.msgtype)})' for one in connections})
-    return ', '.join(found) or 'none'
-
-
-def wheel_names(
-    where: object,
-    topic: str,
-    joints: Collection[str],
-    given: tuple[str, str] | None,
-    parameters: dict[str, dict[str, Any]],
-) -> tuple[str, str]:
-    """Return the joints of the left and the right wheel.
-
-    Raises:
-        BagError: They are missing, or not to be told apart by their names.
-    """
-    if given is not None:
-        if given[0] == given[1]:
-            raise BagError(f"{where}: both wheels are given as the joint '{printable(given[0])}'")
-        for name in given:
-            if name not in joints:
-                raise BagError(
-                    f"{where}: {topic} has no joint '{printable(name)}'; it has {quoted(sorted(joints))}"
-                )
-        return given
-    for values in parameters.values():
-        pair = (values.get('left_wheel_name'), values.get('right_wheel_name'))
-        lists = (values.get('left_wheel_names'), values.get('right_wheel_names'))
-        if all(isinstance(one, list) and one for one in lists):
-            pair = (lists[0][0], lists[1][0])  # type: ignore[index]
-        left, right = pair
-        if isinstance(left, str) and isinstance(right, str) and left in joints and right in joints:
-            return left, right
-    found = [[name for name in joints if side in name.lower()] for side in ('left', 'right')]
-    wheels = [[name for name in names if 'wheel' in name.lower()] or names for names in found]
-    if [len(names) for names in wheels] != [1, 1]:
-        raise BagError(
-            f'{where}: the joints of the wheels on {topic} must be given with --wheels LEFT RIGHT; '
-            f'it has {quoted(sorted(joints))}'
-        )
-    return wheels[0][0], wheels[1][0]
-
-
-def dimensions_of(where: object, parameters: dict[str, dict[str, Any]]) -> tuple[float, float] | None:
-    """Return the wheel radius and the wheel separation of the nodes; None: not recorded (m).
-
-    Raises:
-        BagError: The nodes differ.
-    """
-    found = set()
-    for values in parameters.values():
-        pair = (values.get('wheel_radius'), values.get('wheel_separation'))
-        if all(isinstance(one, (int, float)) and not isinstance(one, bool) for one in pair):
-            radius, separation = (float(one) for one in pair if one is not None)
-            if 0.0 < radius < math.inf and 0.0 < separation < math.inf:
-                found.add((radius, separation))
-    if len(found) > 1:
-        listed = ', '.join(f'{radius:g} and {separation:g} m' for radius, separation in sorted(found))
-        raise BagError(
-            f'{where}: its nodes have several wheel radii and separations, {listed}: choose with '
-            '--wheel-radius and --wheel-separation'
-        )
-    return found.pop() if found else None
-
-
-MISSING = 'are missing in the bag'
-WHEELS, REFERENCE = 'joint_states', 'ground_truth'
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class WheelsAndReference:
-    """What a bag has for a calibration."""
-
-    recording: CalibrationDrive
-    wheels_topic: str
-    reference_topic: str
-    wheel_names: tuple[str, str]
-    """Joints of the left and the right wheel."""
-    dimensions: tuple[float, float] | None
-    """Nominal wheel radius and wheel separation that the bag's parameters have (m)."""
-    notes: tuple[str, ...] = ()
-
-
-def read_wheels_and_reference(
-    path: str | Path,
-    *,
-    wheels: str | None = None,
-    reference: str | None = None,
-    names: tuple[str, str] | None = None,
-    interrupted: Callable[[], bool] = lambda: False,
-) -> WheelsAndReference:
-    """Read the angles of the wheels and the poses of a reference.
-
-    Args:
-        path: The bag's directory, or an MCAP or SQLite file.
-        wheels: Topic of the wheels (default: joint_states, in any namespace).
-        reference: Topic of the reference (default: ground_truth, or the only topic of poses).
-        names: Joints of the left and the right wheel (default: from the parameters in the bag, or the
-            two joints with left and right in their names).
-        interrupted: Is called for each message; once it returns True, reading ends.
-
-    Raises:
-        ReadingInterruptedError: `interrupted` returned True.
-        BagError: It is not a bag, is damaged, or has not what is needed.
-    """
-    path = Path(path)
-    with open_bag(path) as reader:
-        parameters = recorded_parameters(reader)
-        wheels_topic = chosen_topic(reader, wheels, '--wheels-topic', WHEELS, (JOINT_STATE.type_name,))
-        poses_topic = chosen_topic(
-            reader, reference, '--reference', REFERENCE, tuple(POSES), any_name=True
-        )
-        joints, poses = JointRows(), PoseRows()
-        tally = _read(reader, {wheels_topic: joints, poses_topic: poses}, interrupted)
-    where = printable(path, PATH_LIMIT)
-    for topic, count in ((wheels_topic, joints.count), (poses_topic, poses.count)):
-        if not count:
-            raise BagError(f'{where} has no usable message on {topic}{_why(tally, topic)}')
-    chosen = wheel_names(where, wheels_topic, joints.names, names, parameters)
-    measured, from_speeds = joints.of(chosen, where, wheels_topic)
-    poses.check(where, poses_topic)
-    notes = [
-        f'{count} messages on {printable(topic)} {why}{"" if why == MISSING else " and were skipped"}'
-        for (topic, why), count in tally.items()
-    ]
-    observed = poses.samples()
-    wheel_time, pose_time, note = common_clock(measured, observed, wheels_topic, poses_topic)
-    notes += [note] if note else []
-    origin = min(int(np.min(wheel_time)), int(np.min(pose_time)))
-    wheel_seconds, angles = increasing(wheel_time - origin, measured.values, f'{where}: {wheels_topic}')
-    pose_seconds, values = increasing(pose_time - origin, observed.values, f'{where}: {poses_topic}')
-    if from_speeds:
-        angles = integrated(wheel_seconds, angles)
-        notes.append(f'{wheels_topic} has no angles: they are integrated from the speeds')
-    else:
-        angles = unwrapped(wheel_seconds, angles, f'{where}: {wheels_topic}')
-    return WheelsAndReference(
-        recording=CalibrationDrive(
-            name=str(where),
-            wheel_time=wheel_seconds,
-            wheel_angles=angles,
-            pose_time=pose_seconds,
-            poses=values,
-        ),
-        wheels_topic=wheels_topic,
-        reference_topic=poses_topic,
-        wheel_names=chosen,
-        dimensions=dimensions_of(where, parameters),
-        notes=tuple(notes),
-    )
-
-
-def _read(
-    reader: Reader, sinks: dict[str, JointRows | PoseRows], interrupted: Callable[[], bool]
-) -> Counter[tuple[str, str]]:
-    """Read the messages of some topics; return how many were skipped, by topic and reason."""
-    tally: Counter[tuple[str, str]] = Counter()
-    invalid: Counter[str] = Counter()
-    codecs: dict[str, Codec[Any]] = {JOINT_STATE.type_name: JOINT_STATE, **POSES}
-    connections = [one for one in reader.connections if one.topic in sinks and one.msgtype in codecs]
-    readers = {
-        kind: codecs[kind].reader(known_structure(kind)) for kind in {one.msgtype for one in connections}
-    }
-    stored = stored_connections(reader)
-    foreign = {
-        one.id
-        for one in connections
-        if recorded_definition_differs(one.msgtype, type_hashes(one, stored))
-    }
-    found: Counter[str] = Counter()
-    for connection, received, data in messages(reader, connections, invalid):
-        if interrupted():
-            raise ReadingInterruptedError
-        topic = connection.topic
-        found[topic] += 1
-        if connection.id in foreign:
-            tally[topic, f'were recorded with another definition of {connection.msgtype}'] += 1
-            continue
-        try:
-            sinks[topic].add(received, readers[connection.msgtype](data))
-        except LongMessageError:
-            tally[topic, 'have more values than are read'] += 1
-        except DecodingError:
-            tally[topic, 'cannot be decoded'] += 1
-        except MessageError:
-            tally[topic, 'hold invalid or implausible values'] += 1
-    for topic, count in invalid.items():
-        tally[topic, 'cannot be decoded'] += count
-    for topic in sinks:
-        expected = sum(one.msgcount for one in connections if one.topic == topic)
-        if (missing := expected - found[topic] - invalid[topic]) > 0:
-            tally[topic, MISSING] = missing
-    return tally
-
-
-def _why(tally: Counter[tuple[str, str]], topic: str) -> str:
-    reasons = [f'{count} {why}' for (other, why), count in tally.items() if other == topic]
-    return f': {", ".join(reasons)}' if reasons else ''
-
-
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 
@@ -306,17 +59,14 @@ BACK = 0.5
 
 
 class SpatialPlace(NamedTuple):
-    """A pose of a sensor in space."""
+    """A pose of a sensor in space (ns, m, rad)."""
 
     stamp: int
-    """(ns)"""
     frame: str
     x: float
-    """(m), as y and z."""
     y: float
     z: float
     theta: float
-    """Yaw (rad)."""
     tilt: float
     """Angle between its z axis and that of the frame (rad)."""
 
@@ -349,22 +99,16 @@ class Samples:
     """Shape (n, k)."""
 
 
-@dataclass(slots=True)
-class _Layout:
-    """Messages with the same joints, as columns: a bag may have millions of them."""
-
-    order: array[int] = field(default_factory=lambda: array('q'))
-    """Index of each message on its topic, time of recording and stamp (ns), one after the other."""
-    positions: array[float] = field(default_factory=lambda: array('d'))
-    speeds: array[float] = field(default_factory=lambda: array('d'))
-
-
-@dataclass(slots=True)
 class JointRows:
-    """Messages of the joints: time of recording, stamp, positions and speeds by name."""
+    """Messages of the joints, as columns: a bag may have millions of them."""
 
-    layouts: dict[tuple[str, ...], _Layout] = field(default_factory=dict)
-    count: int = 0
+    def __init__(self) -> None:
+        """Start without messages."""
+        self.count = 0
+        # Of the messages with the same joints: index of each on its topic, time of recording and stamp
+        # (ns), one after the other; positions; speeds.
+        self.layouts: defaultdict[tuple[str, ...], tuple[array[int], array[float], array[float]]]
+        self.layouts = defaultdict(lambda: (array('q'), array('d'), array('d')))
 
     def add(self, received: int, wheels: Wheels) -> None:
         """Add a message.
@@ -376,9 +120,9 @@ class JointRows:
         for values in (wheels.positions, wheels.velocities):
             if len(values) not in (0, len(names)):
                 raise MessageError('joint state must have as many values as names')
-        layout = self.layouts.setdefault(names, _Layout())
-        layout.order.extend((self.count, received, wheels.stamp or received))
-        for table, values in ((layout.positions, wheels.positions), (layout.speeds, wheels.velocities)):
+        order, positions, speeds = self.layouts[names]
+        order.extend((self.count, received, wheels.stamp or received))
+        for table, values in ((positions, wheels.positions), (speeds, wheels.velocities)):
             table.extend(values if len(values) else [math.nan] * len(names))
         self.count += 1
 
@@ -399,13 +143,13 @@ class JointRows:
         for are_speeds in (False, True):
             orders: list[Any] = [np.empty((0, 3), dtype=np.int64)]
             values: list[Any] = [np.empty((0, 2))]
-            for names, layout in self.layouts.items():
+            for names, (indices, *tables) in self.layouts.items():
                 if left not in names or right not in names:
                     continue
-                table = layout.speeds if are_speeds else layout.positions
+                table = tables[are_speeds]
                 pairs = _columns(table, len(names))[:, [names.index(right), names.index(left)]]
                 finite = np.isfinite(pairs).all(axis=1)
-                orders.append(np.frombuffer(layout.order, dtype=np.int64).reshape(-1, 3)[finite])
+                orders.append(np.frombuffer(indices, dtype=np.int64).reshape(-1, 3)[finite])
                 values.append(pairs[finite])
             order, found = np.concatenate(orders), np.concatenate(values)
             if len(order) > 1:
@@ -417,22 +161,23 @@ class JointRows:
         )
 
 
-@dataclass(slots=True)
 class PoseRows:
-    """Messages of the reference: time of recording, stamp, x, y, theta, z, tilt."""
+    """Messages of the reference."""
 
-    times: array[int] = field(default_factory=lambda: array('q'))
-    """Time of recording and stamp of each message, one after the other (ns)."""
-    poses: array[float] = field(default_factory=lambda: array('d'))
-    """x, y, theta, z and tilt of each."""
-    frames: Counter[str] = field(default_factory=Counter)
-    count: int = 0
+    def __init__(self) -> None:
+        """Start without messages."""
+        self.count = 0
+        # Time of recording and stamp of each message, one after the other (ns).
+        self.times: array[int] = array('q')
+        # x, y, theta, z and tilt of each.
+        self.poses: array[float] = array('d')
+        self.frames: set[str] = set()
 
     def add(self, received: int, place: SpatialPlace) -> None:
         """Add a message."""
         self.times.extend((received, place.stamp or received))
         self.poses.extend((place.x, place.y, place.theta, place.z, place.tilt))
-        self.frames[place.frame] += 1
+        self.frames.add(place.frame)
         self.count += 1
 
     def samples(self) -> Samples:
@@ -500,13 +245,6 @@ def increasing(times: Times, values: Array, what: str) -> tuple[Array, Array]:
     return np.asarray(unique / NANOSECONDS), values[first]
 
 
-def integrated(time: Array, speeds: Array) -> Array:
-    """Return angles from speeds, by trapezoids, shape (n, 2) (rad)."""
-    means = (speeds[1:] + speeds[:-1]) / 2.0
-    steps = means * np.diff(time)[:, None]
-    return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-
-
 def unwrapped(time: Array, angles: Array, what: str) -> Array:
     """Return angles that are continuous, shape (n, 2) (rad). Those within one turn are unwrapped.
 
@@ -524,3 +262,240 @@ def unwrapped(time: Array, angles: Array, what: str) -> Array:
             'was reset; split the bag there'
         )
     return angles
+
+
+NO_REFERENCE = ('odom', 'goal_pose', 'initialpose', 'start_pose')
+"""Topics that are no reference unless they are chosen: odometry is computed from the wheels."""
+MISSING = 'are missing in the bag'
+
+
+def chosen_topic(
+    reader: Reader,
+    given: str | None,
+    option: str,
+    usual: str,
+    types: Sequence[str],
+    *,
+    any_name: bool = False,
+) -> str:
+    """Return the topic that is given, or the only one of some types with the usual base name.
+
+    With `any_name` that may also be the only topic of these types, unless it is one of `NO_REFERENCE`.
+
+    Raises:
+        BagError: There is none or several, or the given one is missing or has another type.
+    """
+    where = printable(reader.path, PATH_LIMIT)
+    candidates = sorted({one.topic for one in reader.connections if one.msgtype in types})
+    found = {f'{printable(one.topic)} ({printable(one.msgtype)})' for one in reader.connections}
+    listed = ', '.join(sorted(found)) or 'none'
+    allowed = ' or '.join(types)
+    if given is not None:
+        topic = given if given.startswith('/') else f'/{given}'
+        if topic in candidates:
+            return topic
+        others = sorted({one.msgtype for one in reader.connections if one.topic == topic})
+        if others:
+            raise BagError(f'{where}: {topic} must be of type {allowed}, got {", ".join(others)}')
+        raise BagError(f'{where} has no topic {topic}; it has {listed}')
+    named = [topic for topic in candidates if base_name(topic) == usual]
+    if not named and any_name:
+        named = [topic for topic in candidates if base_name(topic) not in NO_REFERENCE]
+    if len(named) == 1:
+        return named[0]
+    if not named:
+        hint = f' (choose one with {option})' if candidates else ''
+        raise BagError(f'{where} has no topic {usual} of type {allowed}; it has {listed}{hint}')
+    raise BagError(f'{where} has several such topics, {", ".join(named)}: choose one with {option}')
+
+
+def wheel_names(
+    where: object,
+    topic: str,
+    joints: Collection[str],
+    given: tuple[str, str] | None,
+    parameters: dict[str, dict[str, Any]],
+) -> tuple[str, str]:
+    """Return the joints of the left and the right wheel.
+
+    Raises:
+        BagError: They are missing, or not to be told apart by their names.
+    """
+    if given is not None:
+        if given[0] == given[1]:
+            raise BagError(f"{where}: both wheels are given as the joint '{printable(given[0])}'")
+        for name in given:
+            if name not in joints:
+                raise BagError(
+                    f"{where}: {topic} has no joint '{printable(name)}'; it has {quoted(sorted(joints))}"
+                )
+        return given
+    for values in parameters.values():
+        pair = (values.get('left_wheel_name'), values.get('right_wheel_name'))
+        lists = (values.get('left_wheel_names'), values.get('right_wheel_names'))
+        if all(isinstance(one, list) and one for one in lists):
+            pair = (lists[0][0], lists[1][0])  # type: ignore[index]
+        left, right = pair
+        if isinstance(left, str) and isinstance(right, str) and left in joints and right in joints:
+            return left, right
+    found = [[name for name in joints if side in name.lower()] for side in ('left', 'right')]
+    wheels = [[name for name in names if 'wheel' in name.lower()] or names for names in found]
+    if [len(names) for names in wheels] != [1, 1]:
+        raise BagError(
+            f'{where}: the joints of the wheels on {topic} must be given with --wheels LEFT RIGHT; '
+            f'it has {quoted(sorted(joints))}'
+        )
+    return wheels[0][0], wheels[1][0]
+
+
+def dimensions_of(where: object, parameters: dict[str, dict[str, Any]]) -> tuple[float, float] | None:
+    """Return the wheel radius and the wheel separation of the nodes; None: not recorded (m).
+
+    Raises:
+        BagError: The nodes differ.
+    """
+    found = set()
+    for values in parameters.values():
+        pair = (values.get('wheel_radius'), values.get('wheel_separation'))
+        if all(isinstance(one, (int, float)) and not isinstance(one, bool) for one in pair):
+            radius, separation = (float(one) for one in pair if one is not None)
+            if 0.0 < radius < math.inf and 0.0 < separation < math.inf:
+                found.add((radius, separation))
+    if len(found) > 1:
+        listed = ', '.join(f'{radius:g} and {separation:g} m' for radius, separation in sorted(found))
+        raise BagError(
+            f'{where}: its nodes have several wheel radii and separations, {listed}: choose with '
+            '--wheel-radius and --wheel-separation'
+        )
+    return found.pop() if found else None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WheelsAndReference:
+    """What a bag has for a calibration."""
+
+    recording: CalibrationDrive
+    wheels_topic: str
+    reference_topic: str
+    wheel_names: tuple[str, str]
+    """Joints of the left and the right wheel."""
+    dimensions: tuple[float, float] | None
+    """Nominal wheel radius and wheel separation that the bag's parameters have (m)."""
+    notes: tuple[str, ...] = ()
+
+
+def read_wheels_and_reference(
+    path: str | Path,
+    *,
+    wheels: str | None = None,
+    reference: str | None = None,
+    names: tuple[str, str] | None = None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> WheelsAndReference:
+    """Read the angles of the wheels and the poses of a reference.
+
+    Args:
+        path: The bag's directory, or an MCAP or SQLite file.
+        wheels: Topic of the wheels (default: joint_states, in any namespace).
+        reference: Topic of the reference (default: ground_truth, or the only topic of poses).
+        names: Joints of the left and the right wheel (default: from the parameters in the bag, or the
+            two joints with left and right in their names).
+        interrupted: Is called for each message; once it returns True, reading ends.
+
+    Raises:
+        ReadingInterruptedError: `interrupted` returned True.
+        BagError: It is not a bag, is damaged, or has not what is needed.
+    """
+    path = Path(path)
+    with open_bag(path) as reader:
+        parameters = recorded_parameters(reader)
+        wheels_topic = chosen_topic(
+            reader, wheels, '--wheels-topic', 'joint_states', (JOINT_STATE.type_name,)
+        )
+        poses_topic = chosen_topic(
+            reader, reference, '--reference', 'ground_truth', tuple(POSES), any_name=True
+        )
+        joints, poses = JointRows(), PoseRows()
+        tally = _read(reader, {wheels_topic: joints, poses_topic: poses}, interrupted)
+    where = printable(path, PATH_LIMIT)
+    for topic, count in ((wheels_topic, joints.count), (poses_topic, poses.count)):
+        if not count:
+            reasons = ', '.join(f'{number} {why}' for (on, why), number in tally.items() if on == topic)
+            colon = ': ' if reasons else ''
+            raise BagError(f'{where} has no usable message on {topic}{colon}{reasons}')
+    chosen = wheel_names(where, wheels_topic, joints.names, names, parameters)
+    measured, from_speeds = joints.of(chosen, where, wheels_topic)
+    poses.check(where, poses_topic)
+    notes = [
+        f'{count} messages on {printable(topic)} {why}{" and were skipped" * (why != MISSING)}'
+        for (topic, why), count in tally.items()
+    ]
+    observed = poses.samples()
+    wheel_time, pose_time, note = common_clock(measured, observed, wheels_topic, poses_topic)
+    notes += [note] if note else []
+    origin = min(int(np.min(wheel_time)), int(np.min(pose_time)))
+    wheel_seconds, angles = increasing(wheel_time - origin, measured.values, f'{where}: {wheels_topic}')
+    pose_seconds, values = increasing(pose_time - origin, observed.values, f'{where}: {poses_topic}')
+    if from_speeds:
+        steps = (angles[1:] + angles[:-1]) / 2.0 * np.diff(wheel_seconds)[:, None]
+        angles = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+        notes.append(f'{wheels_topic} has no angles: they are integrated from the speeds')
+    else:
+        angles = unwrapped(wheel_seconds, angles, f'{where}: {wheels_topic}')
+    return WheelsAndReference(
+        recording=CalibrationDrive(
+            name=str(where),
+            wheel_time=wheel_seconds,
+            wheel_angles=angles,
+            pose_time=pose_seconds,
+            poses=values,
+        ),
+        wheels_topic=wheels_topic,
+        reference_topic=poses_topic,
+        wheel_names=chosen,
+        dimensions=dimensions_of(where, parameters),
+        notes=tuple(notes),
+    )
+
+
+def _read(
+    reader: Reader, sinks: dict[str, JointRows | PoseRows], interrupted: Callable[[], bool]
+) -> Counter[tuple[str, str]]:
+    """Read the messages of some topics; return how many were skipped, by topic and reason."""
+    tally: Counter[tuple[str, str]] = Counter()
+    invalid: Counter[str] = Counter()
+    codecs: dict[str, Codec[Any]] = {JOINT_STATE.type_name: JOINT_STATE, **POSES}
+    connections = [one for one in reader.connections if one.topic in sinks and one.msgtype in codecs]
+    readers = {
+        kind: codecs[kind].reader(known_structure(kind)) for kind in {one.msgtype for one in connections}
+    }
+    stored = stored_connections(reader)
+    foreign = {
+        one.id
+        for one in connections
+        if recorded_definition_differs(one.msgtype, type_hashes(one, stored))
+    }
+    found: Counter[str] = Counter()
+    for connection, received, data in messages(reader, connections, invalid):
+        if interrupted():
+            raise ReadingInterruptedError
+        topic = connection.topic
+        found[topic] += 1
+        if connection.id in foreign:
+            tally[topic, f'were recorded with another definition of {connection.msgtype}'] += 1
+            continue
+        try:
+            sinks[topic].add(received, readers[connection.msgtype](data))
+        except LongMessageError:
+            tally[topic, 'have more values than are read'] += 1
+        except DecodingError:
+            tally[topic, 'cannot be decoded'] += 1
+        except MessageError:
+            tally[topic, 'hold invalid or implausible values'] += 1
+    for topic, count in invalid.items():
+        tally[topic, 'cannot be decoded'] += count
+    for topic in sinks:
+        expected = sum(one.msgcount for one in connections if one.topic == topic)
+        if (missing := expected - found[topic] - invalid[topic]) > 0:
+            tally[topic, MISSING] = missing
+    return tally

@@ -206,7 +206,7 @@ class Block:
     def drive(
         self, keep: Keep | None, on_step: Callable[[], object] | None = None
     ) -> Iterator[tuple[Rows, Outcomes]]:
-        """Drive the robots until each has arrived or is given up. Yield finished rows and their outcomes.
+        """Drive the robots until each has arrived or is given up; yield finished rows and outcomes.
 
         `keep` is called with every sample of every robot, `on_step` at the beginning of every step.
         """

@@ -20,7 +20,7 @@ from diffdrive_jacobian.calibration.description import (
     rms,
     tracks,
 )
-from diffdrive_jacobian.calibration.fit import fit, information
+from diffdrive_jacobian.calibration.fit import fit, score
 from diffdrive_jacobian.calibration.model import Estimate, undetermined
 from diffdrive_jacobian.calibration.motion import composed, increments, inverted, relative
 from diffdrive_jacobian.calibration.preparation import PERIOD, densified, located, overlapping, without
@@ -139,10 +139,8 @@ def test_information_equals_that_of_a_dense_model(steps):
         normal[block, block] += np.linalg.inv(found.covariance[i - 1] * noise.wheel)
     readings = np.arange(3 * n, 5 * n)
     normal[readings, readings] += 1.0
-    free = np.zeros(7, dtype=bool)
-    free[:3] = True
     expected = np.linalg.inv(normal)[-3:, -3:]
-    bound = np.linalg.inv(information([motion], NOMINAL, replace(truth, free=free)))
+    bound = np.linalg.inv(score([motion], NOMINAL, truth)[0][:3, :3])
     np.testing.assert_allclose(bound, expected, rtol=1e-6)
 
 
@@ -181,7 +179,7 @@ def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance()
             states=(states,),
             information=np.zeros((0, 0)),
         )
-        bounds.append(np.diag(np.linalg.inv(information([motion], NOMINAL, known)))[:3])
+        bounds.append(np.diag(np.linalg.inv(score([motion], NOMINAL, known)[0]))[:3])
     ratio = np.mean(np.square(errors) / np.array(TRUE) ** 2 / bounds, axis=0)
     # The mean of squares of 16 numbers of variance 1 has the deviation sqrt(2 / 16).
     assert (np.abs(ratio - 1.0) < 3.5 * np.sqrt(2.0 / count)).all(), ratio
