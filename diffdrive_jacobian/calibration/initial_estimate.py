@@ -7,7 +7,7 @@ do not fit have no weight.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +84,7 @@ def initial_estimate(segments: Sequence[Segment], nominal: Geometry, offsets: Ar
     turns = np.concatenate([turn for _, turn in parts])
     moves = max(float(np.max(np.ptp(one.poses[:, :2], axis=0))) for one in segments) > LEAST_MOVE
     _check_turning(angles, turns, (rims[:, 0] - rims[:, 1]) / separation, moves)
-    gains, _ = _robust(
+    gains = _robust(
         np.column_stack([rims[:, 0], -rims[:, 1]]) / separation, turns, [1.0, 1.0], [0.7, 0.7], 0.02
     )
     if gains.sum() < 0.0:
@@ -95,19 +95,10 @@ def initial_estimate(segments: Sequence[Segment], nominal: Geometry, offsets: Ar
         )
     # From here on the turns of the wheels agree with those of the reference.
     gains = np.clip(gains, 0.05, 20.0)
-    turning = Geometry(
-        wheel_radius=nominal.wheel_radius,
-        wheel_separation=nominal.wheel_separation,
-        multipliers=(float(gains[1]), float(gains[0]), 1.0),
-    )
-    rows, values = [], []
-    for one in segments:
-        A, b = _positions(one, turning, offsets[one.recording])
-        rows.append(A)
-        values.append(b)
-    found, _ = _robust(
-        np.concatenate(rows), np.concatenate(values), [1.0, 0.0, 0.0, 0.0], [10.0, 10.0, 1.0, 1.0], 0.01
-    )
+    turning = replace(nominal, multipliers=(float(gains[1]), float(gains[0]), 1.0))
+    equations = (_positions(one, turning, offsets[one.recording]) for one in segments)
+    A, b = map(np.concatenate, zip(*equations, strict=True))
+    found = _robust(A, b, [1.0, 0.0, 0.0, 0.0], [10.0, 10.0, 1.0, 1.0], 0.01)
     scale = float(np.hypot(*found[:2]))
     if not 0.05 <= scale <= 20.0:
         raise CalibrationError(
@@ -118,11 +109,7 @@ def initial_estimate(segments: Sequence[Segment], nominal: Geometry, offsets: Ar
     c, s = np.cos(yaw), np.sin(yaw)
     lever = np.array([[c, -s], [s, c]]) @ found[2:]
     left, right = (float(np.clip(gain * scale, 0.05, 20.0)) for gain in (gains[1], gains[0]))
-    geometry = Geometry(
-        wheel_radius=nominal.wheel_radius,
-        wheel_separation=nominal.wheel_separation,
-        multipliers=(left, right, float(np.clip(scale, 0.05, 20.0))),
-    )
+    geometry = replace(nominal, multipliers=(left, right, scale))
     return InitialEstimate(geometry=geometry, sensor=np.array([*lever, yaw]))
 
 
@@ -149,22 +136,19 @@ def _check_turning(angles: Array, turns: Array, expected: Array, moves: bool) ->
         )
 
 
-def _ends(travel: Array, length: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _ends(travel: Array, separation: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the first and the last pose of each part."""
+    length = max(2.0 * separation, float(travel.sum()) / PARTS)
     place = np.concatenate([[0.0], np.cumsum(travel)])
     bounds = np.unique(np.searchsorted(place, np.arange(0.0, place[-1] + length, length)))
     bounds = np.unique(np.minimum(bounds, len(place) - 1))
     return bounds[:-1], bounds[1:]
 
 
-def _part_length(travel: Array, separation: float) -> float:
-    return max(2.0 * separation, float(travel.sum()) / PARTS)
-
-
 def _parts(segment: Segment, nominal: Geometry, offset: float) -> tuple[Array, Array]:
     """Return the turns of both wheels and of the sensor in each part, shapes (n, 2) and (n,) (rad)."""
     moved = _moved(segment, nominal, offset)
-    first, last = _ends(moved.travel, _part_length(moved.travel, nominal.separation))
+    first, last = _ends(moved.travel, nominal.separation)
     at = segment.time + offset
     angles = np.column_stack(
         [np.interp(at, segment.wheel_time, segment.wheel_angles[:, side]) for side in (0, 1)]
@@ -178,7 +162,7 @@ def _parts(segment: Segment, nominal: Geometry, offset: float) -> tuple[Array, A
 def _positions(segment: Segment, geometry: Geometry, offset: float) -> tuple[Array, Array]:
     """Return equations for the scale, the yaw offset and the lever arm: `A x = b`."""
     moved = _moved(segment, geometry, offset)
-    first, last = _ends(moved.travel, _part_length(moved.travel, geometry.separation))
+    first, last = _ends(moved.travel, geometry.separation)
     step = relative(moved.poses[first], moved.poses[last])
     found = relative(segment.poses[first], segment.poses[last])
     c, s = np.cos(step[:, 2]), np.sin(step[:, 2])
@@ -189,7 +173,7 @@ def _positions(segment: Segment, geometry: Geometry, offset: float) -> tuple[Arr
 
 def _robust(
     A: Array, b: Array, prior: Sequence[float], deviations: Sequence[float], noise: float
-) -> tuple[Array, float]:
+) -> Array:
     """Return the least-squares solution of `A x = b` without outliers (Tukey).
 
     `noise` is the standard deviation of the equations for the weight of the prior, and the least scale.
@@ -197,7 +181,6 @@ def _robust(
     ridge = np.diag(noise**2 / np.square(deviations))
     target = ridge @ np.asarray(prior)
     weights: Array = np.ones(len(b))
-    scale = noise
     x: Array = np.asarray(prior, dtype=np.float64)
     for _ in range(ROUNDS):
         weighted = A * weights[:, None]
@@ -205,4 +188,4 @@ def _robust(
         error = np.abs(b - A @ x)
         scale = max(noise, 1.4826 * float(np.median(error)))
         weights = np.maximum(0.0, 1.0 - (error / (6.0 * scale)) ** 2) ** 2
-    return x, scale
+    return x

@@ -235,15 +235,6 @@ def thinned_poses(segments: Sequence[Segment]) -> tuple[list[Segment], str]:
     return kept, note
 
 
-def gaps(time: Array) -> list[tuple[float, float]]:
-    """Return pauses between samples that are much longer than usual: their beginning and length (s)."""
-    steps = np.diff(time)
-    if not len(steps):
-        return []
-    long = np.flatnonzero(steps > max(2.0 * GAP, 10.0 * float(np.median(steps))))
-    return [(float(time[i]), float(steps[i])) for i in long]
-
-
 def sampling_notes(one: CalibrationDrive) -> list[str]:
     """Return descriptions of gaps, and of wheels that are recorded too rarely."""
     lines = []
@@ -254,12 +245,14 @@ def sampling_notes(one: CalibrationDrive) -> list[str]:
             'guessed: record them at 10 Hz or more'
         )
     for what, time in (('reference', one.pose_time), ('wheels', one.wheel_time)):
-        found = gaps(time)
-        if found:
-            begin, length = max(found, key=lambda gap: gap[1])
+        steps = np.diff(time)
+        # Much longer than usual.
+        long = int(np.count_nonzero(steps > max(2.0 * GAP, 10.0 * float(np.median(steps)))))
+        if long:
+            at = int(np.argmax(steps))
             lines.append(
-                f'{one.name}: {len(found)} gap{"" if len(found) == 1 else "s"} in the {what}, '
-                f'the longest of {length:.1f} s at {begin:.3f} s'
+                f'{one.name}: {long} gap{"s" * (long > 1)} in the {what}, '
+                f'the longest of {steps[at]:.1f} s at {time[at]:.3f} s'
             )
     return lines
 
