@@ -21,6 +21,7 @@ from support.ros_messages import twist
 
 from diffdrive_jacobian.calibration import PARAMETERS, calibrate, fit
 from diffdrive_jacobian.calibration.data import read_wheels_and_reference, wheel_names
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters
 from diffdrive_jacobian.plots.calibration_figure import figure
 from diffdrive_jacobian.signals import Signals
@@ -96,9 +97,9 @@ def left(folder):
 @pytest.mark.slow
 @pytest.mark.usefixtures('no_display')
 def test_it_writes_parameters_and_a_picture(bag, folder, lockstep):
-    from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-
-    code, out, err = run(bag, '-o', 'found.yaml')
+    for name in ('found.yaml', 'found.png'):
+        (folder / name).write_text('replaced by --force')
+    code, out, err = run(bag, '-o', 'found.yaml', '--force')
     assert (code, err) == (0, '')
     found, values = multipliers(folder / 'found.yaml')
     np.testing.assert_allclose(found, TRUE, atol=0.01)
@@ -257,16 +258,10 @@ def test_a_straight_drive_is_refused_in_words(folder):
     assert left(folder) == ['straight']
 
 
-def test_bags_that_disagree_are_refused(bag, folder):
-    other = recorded(replace(ROBOT, multipliers=(1.0, 1.0, 1.0)), seed=4)
-    write(folder / 'other', bag_messages(other))
-    assert 'the recordings disagree' in failed(bag, 'other', '-o', 'found.yaml')[1]
-    assert left(folder) == ['other']
-
-
 def test_too_short_a_drive(folder):
     write(folder / 'short', bag_messages(recorded(ROBOT, (1.0, 0.2, 0.5))))
     assert 'too short' in failed('short')[1]
+    assert left(folder) == ['short']
     assert 'each bag can be given once' in refused('short', 'short')
 
 
@@ -370,15 +365,6 @@ def test_topics_and_dimensions_must_be_known_and_unique(folder):
 
 
 # --- Files
-
-
-def test_force_replaces_both_files(bag, folder, monkeypatch):
-    monkeypatch.setattr(calibrate_run, 'draw', lambda *_: b'picture')
-    for name in ('found.yaml', 'found.png'):
-        (folder / name).write_text('mine')
-    assert run(bag, '-o', 'found.yaml', '--force').code == 0
-    assert 'multiplier' in (folder / 'found.yaml').read_text()
-    assert (folder / 'found.png').read_bytes() == b'picture'
 
 
 def test_nothing_stays_if_the_picture_cannot_be_written(bag, folder, monkeypatch):
