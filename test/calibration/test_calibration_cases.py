@@ -1,4 +1,4 @@
-"""Calibrations of robots that other code simulates: the cases of the benchmark, and a drive in lockstep."""
+"""Calibrations of robots that other code simulates: cases of the benchmark, a drive in lockstep."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def driven(pose, u, slope, y, seconds, tau):
 @pytest.mark.parametrize('tau', [0.0, 0.05, 0.3])
 def test_the_pose_is_that_of_an_integration_in_extended_precision(tau):
     rng = np.random.default_rng(31)
-    for _ in range(15):
+    for _ in range(8):
         times = np.sort(rng.integers(0, 8 * SECOND, 6))
         times[0] = 0
         twists = np.round(rng.uniform((-0.5, -2.0), (0.5, 2.0), (6, 2)), 3)
@@ -165,7 +165,6 @@ def test_from_rest_to_a_speed_and_back_in_closed_form():
     rest = stopped.at(stopped.settles_at)
     assert rest.twist == (0.0, 0.0)
     close(rest.pose[0] - there.pose[0], 0.4**2 / 2 / 0.8)
-    close(rest.pose[0] - there.pose[0], AxisLimits(**V).stopping_distance(0.4))
     assert rest.wheel_angles[0] == pytest.approx(rest.pose[0] / 0.033, rel=1e-12)
 
 
@@ -353,14 +352,6 @@ def test_one_speed_is_that_of_diff_drive_controller_at_the_ends_of_its_cycles(ax
             assert after == pytest.approx(theirs, abs=1e-12)
     assert compared['rising'] > 240
     assert compared['crossing'] > 3
-
-
-def test_without_limits_the_rates_are_infinite():
-    twist = (0.3, -1.2)
-    plain = Robot(model=RobotModel(), stamp=0, pose=(0.0, 0.0, 0.0)).commanded(twist, 0)
-    for acceleration in (AccelerationLimits(), AccelerationLimits(v=AxisLimits())):
-        robot = at_rest(acceleration=acceleration).commanded(twist, 0)
-        assert robot.at(SECOND).pose_tuple == plain.at(SECOND).pose_tuple
 
 
 def test_limits_with_the_wrong_sign_are_refused():

@@ -14,7 +14,6 @@ from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.exact_moments import (
     SHORT_NOISE,
     SHORT_TURN,
-    Moments,
     NoiseMoments,
     central,
     gaussian,
@@ -119,41 +118,6 @@ def test_the_short_form_is_the_series_up_to_its_limits(m, turn, alpha):
         assert abs(error) <= 1e-13 * position
 
 
-@pytest.mark.parametrize('side', [0.999999, 1.000001])
-@pytest.mark.parametrize(('v', 'omega'), [(0.2, 1.0), (0.0, 2.0), (-0.2, 0.0)])
-def test_on_both_sides_of_the_limits_of_the_short_form_the_moments_are_exact(v, omega, side):
-    duration = side * SHORT_TURN / abs(omega or 1.0)
-    rate = (abs(v + omega * L / 2.0) + abs(v - omega * L / 2.0)) / (2.0 * L * L)
-    for k in (0.5 * SHORT_NOISE / rate / duration, SHORT_NOISE / rate / duration * side):
-        for start in STARTS:
-            actual = propagate_moments(gaussian(start), START, (v, omega), duration, L, k)
-            expected = reference(gaussian(start), START[2], (v, omega), duration, L, k)
-            close(actual, expected, tolerance=2e-13)
-
-
-def test_driving_straight_the_mean_falls_short_by_the_known_amount():
-    v, duration = 0.22, 60.0
-    rate = 2.0 * K * v / L**2
-    moments = propagate_moments(SURE, np.zeros(3), (v, 0.0), duration, L, K)
-    mean = v * -math.expm1(-rate * duration / 2.0) / (rate / 2.0)
-    assert moments.mean == pytest.approx([mean - v * duration, 0.0, 0.0], rel=1e-9)
-    assert moments.x == pytest.approx(-0.03397, abs=1e-5)
-    assert moments.tt == pytest.approx(rate * duration, rel=1e-14)
-
-
-def test_without_noise_an_unsure_heading_spreads_the_position_on_a_circle():
-    """The error is that of a displacement turned by a Gaussian angle: known in closed form."""
-    variance, way = 0.3, 5.0
-    start = gaussian(np.diag([0.0, 0.0, variance]))
-    moments = propagate_moments(start, np.zeros(3), (1.0, 0.0), way, L, 0.0)
-    mean = math.exp(-variance / 2.0)
-    double = math.exp(-2.0 * variance)
-    assert moments.xx == pytest.approx(way**2 * ((1.0 + double) / 2.0 - 2.0 * mean + 1.0), rel=1e-12)
-    assert moments.yy == pytest.approx(way**2 * (1.0 - double) / 2.0, rel=1e-14)
-    assert moments.yt == pytest.approx(way * variance * mean, rel=1e-14)
-    assert moments.x == pytest.approx(way * (mean - 1.0), rel=1e-13)
-
-
 @pytest.mark.parametrize('offset', [0.0, 1e6])
 def test_far_from_the_origin_nothing_cancels(offset):
     rng = np.random.default_rng(3)
@@ -226,9 +190,3 @@ def test_the_first_order_form_is_too_small_after_a_minute():
     first = propagate_covariance(NONE, np.zeros(3), *drive[0], L, K)
     assert errors[:, 0].std() > 4.0 * math.sqrt(first[0, 0])
     assert np.einsum('ni,ij,nj->n', errors, np.linalg.inv(first), errors).mean() > 30.0
-
-
-def test_moments_are_a_small_value():
-    assert isinstance(SURE, Moments)
-    assert len(SURE) == 12
-    assert all(type(entry) is float for entry in SURE)

@@ -182,7 +182,7 @@ def test_the_figure_has_the_region_and_the_ellipse():
 
 @pytest.mark.parametrize('entry', [math.nan, -1.0, 0.0])
 def test_covariances_that_are_not_of_wheels_are_not_drawn(entry):
-    run = driven([((0.22, 0.0), 1.0)])
+    run = driven([((0.22, 0.0), 1.0)], rate=10)
     for column in range(9):
         covariances = run.odometry_covariances.copy()
         covariances[:, column] = entry
