@@ -6,12 +6,7 @@ from typing import TYPE_CHECKING
 
 from diffdrive_jacobian import lazy
 from diffdrive_jacobian.calibration.calibrate import PARAMETERS, Calibration, calibrate
-from diffdrive_jacobian.calibration.model import (
-    CalibrationDrive,
-    CalibrationError,
-    Given,
-    Noise,
-)
+from diffdrive_jacobian.calibration.model import CalibrationDrive, CalibrationError, Given, Noise
 from diffdrive_jacobian.calibration.motion import Geometry
 
 if TYPE_CHECKING:
@@ -33,8 +28,5 @@ if not TYPE_CHECKING:
     # The calibration itself needs NumPy only, no bags.
     __getattr__, __dir__ = lazy.attach(
         __name__,
-        {
-            'WheelsAndReference': 'calibration.data',
-            'read_wheels_and_reference': 'calibration.data',
-        },
+        {'WheelsAndReference': 'calibration.data', 'read_wheels_and_reference': 'calibration.data'},
     )

@@ -260,11 +260,7 @@ def _check(one: CalibrationDrive) -> None:
 
 
 def _judged(result: Calibration, given: Given) -> list[str]:
-    """Return what is notable about the multipliers, the noise and the sensor.
-
-    Raises:
-        CalibrationError: They cannot be those of a robot and its reference.
-    """
+    """Return notes about multipliers, noise and sensor; CalibrationError if they are impossible."""
     values, noise = result.multipliers, result.estimate.noise
     other_unit = unit(float(np.exp(np.log(values).mean())))
     if (values < BOUNDS[0]).any() or (values > BOUNDS[1]).any():
@@ -341,18 +337,11 @@ def _estimated(
 
 
 def _consistent(
-    segments: Sequence[Segment],
-    nominal: Geometry,
-    start: Estimate,
-    given: Given,
-    names: Sequence[str],
+    segments: Sequence[Segment], nominal: Geometry, start: Estimate, given: Given, names: Sequence[str]
 ) -> tuple[list[Segment], list[Segment], Estimate, list[str]]:
     """Return the segments, motions and estimate without parts that do not fit, and notes about these.
 
     Where it is unknown which part is right, either may be: the estimate is the mean of both.
-
-    Raises:
-        CalibrationError: The recordings disagree, or too little fits.
     """
     segments, left_out = list(segments), 0.0
     notes: list[str] = []

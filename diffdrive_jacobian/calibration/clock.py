@@ -39,11 +39,7 @@ REMEDY = 'synchronize the clocks, or give the offset (--time-offset of calibrate
 
 
 def time_offset(recording: CalibrationDrive, nominal: Geometry) -> float | None:
-    """Return what must be added to the times of the poses; None: the speeds do not show it.
-
-    Raises:
-        CalibrationError: Several offsets are about as good, or the best one is at the end of the range.
-    """
+    """Return what must be added to the times of the poses; None: the speeds do not show it."""
     wheels, poses = recording.wheel_time, recording.pose_time
     window = max(WINDOW, *(float(np.median(np.diff(time))) for time in (wheels, poses)))
     length = max(wheels[-1] - wheels[0], poses[-1] - poses[0])

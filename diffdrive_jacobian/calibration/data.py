@@ -111,11 +111,7 @@ class JointRows:
         self.layouts = defaultdict(lambda: (array('q'), array('d'), array('d')))
 
     def add(self, received: int, wheels: Wheels) -> None:
-        """Add a message.
-
-        Raises:
-            MessageError: It is invalid.
-        """
+        """Add a message; MessageError if it is invalid."""
         names = wheels.joints
         for values in (wheels.positions, wheels.velocities):
             if len(values) not in (0, len(names)):
@@ -132,13 +128,7 @@ class JointRows:
         return list(dict.fromkeys(name for names in self.layouts for name in names))
 
     def of(self, wheels: tuple[str, str], where: object, topic: str) -> tuple[Samples, bool]:
-        """Return the angles of the right and the left wheel, or their speeds, and whether it is these.
-
-        `wheels` are the joints of the left and the right wheel.
-
-        Raises:
-            BagError: There are fewer than two of both.
-        """
+        """Return angles of right and left wheel, or their speeds, and whether it is these, by joints."""
         left, right = wheels
         for are_speeds in (False, True):
             orders: list[Any] = [np.empty((0, 3), dtype=np.int64)]
@@ -210,11 +200,7 @@ def _columns(table: array[float], width: int) -> Array:
 def common_clock(
     wheels: Samples, poses: Samples, wheels_topic: str, poses_topic: str
 ) -> tuple[Times, Times, str]:
-    """Return the times of the wheels and of the poses, and a note.
-
-    These are the stamps. If the stamps have no time in common, the clocks differ, and the times of
-    recording are returned.
-    """
+    """Return the times of wheels and poses: their stamps, or those of recording and a note why."""
     begin = max(int(np.min(wheels.stamps)), int(np.min(poses.stamps)))
     end = min(int(np.max(wheels.stamps)), int(np.max(poses.stamps)))
     if begin < end:
@@ -228,11 +214,7 @@ def common_clock(
 
 
 def increasing(times: Times, values: Array, what: str) -> tuple[Array, Array]:
-    """Return times in s, sorted, each once, with their values.
-
-    Raises:
-        BagError: The clock was reset.
-    """
+    """Return times in s, sorted, each once, with their values; BagError if the clock was reset."""
     steps = np.diff(times)
     if len(steps) and steps.min() < -BACK * NANOSECONDS:
         at = int(np.argmin(steps))
@@ -246,11 +228,7 @@ def increasing(times: Times, values: Array, what: str) -> tuple[Array, Array]:
 
 
 def unwrapped(time: Array, angles: Array, what: str) -> Array:
-    """Return angles that are continuous, shape (n, 2) (rad). Those within one turn are unwrapped.
-
-    Raises:
-        BagError: An angle jumps.
-    """
+    """Return continuous angles, shape (n, 2) (rad): those within one turn are unwrapped."""
     if len(angles) > 1 and np.ptp(angles) <= 2.0 * math.pi + 1e-3:
         angles = np.asarray(np.unwrap(angles, axis=0), dtype=np.float64)
     speeds = np.abs(np.diff(angles, axis=0)).max(axis=1) / np.maximum(np.diff(time), 1e-3)
@@ -281,9 +259,6 @@ def chosen_topic(
     """Return the topic that is given, or the only one of some types with the usual base name.
 
     With `any_name` that may also be the only topic of these types, unless it is one of `NO_REFERENCE`.
-
-    Raises:
-        BagError: There is none or several, or the given one is missing or has another type.
     """
     where = printable(reader.path, PATH_LIMIT)
     candidates = sorted({one.topic for one in reader.connections if one.msgtype in types})
@@ -316,11 +291,7 @@ def wheel_names(
     given: tuple[str, str] | None,
     parameters: dict[str, dict[str, Any]],
 ) -> tuple[str, str]:
-    """Return the joints of the left and the right wheel.
-
-    Raises:
-        BagError: They are missing, or not to be told apart by their names.
-    """
+    """Return the joints of the left and the right wheel."""
     if given is not None:
         if given[0] == given[1]:
             raise BagError(f"{where}: both wheels are given as the joint '{printable(given[0])}'")
@@ -349,11 +320,7 @@ def wheel_names(
 
 
 def dimensions_of(where: object, parameters: dict[str, dict[str, Any]]) -> tuple[float, float] | None:
-    """Return the wheel radius and the wheel separation of the nodes; None: not recorded (m).
-
-    Raises:
-        BagError: The nodes differ.
-    """
+    """Return the wheel radius and the wheel separation of the nodes; None: not recorded (m)."""
     found = set()
     for values in parameters.values():
         pair = (values.get('wheel_radius'), values.get('wheel_separation'))

@@ -9,13 +9,7 @@ import numpy as np
 
 from diffdrive_jacobian.calibration.calibrate import PARAMETERS, Calibration
 from diffdrive_jacobian.calibration.model import Array
-from diffdrive_jacobian.calibration.motion import (
-    Geometry,
-    composed,
-    increments,
-    inverted,
-    relative,
-)
+from diffdrive_jacobian.calibration.motion import Geometry, composed, increments, inverted, relative
 from diffdrive_jacobian.numerics.elementary import wrap
 
 DISTANCE = 5.0
@@ -49,10 +43,7 @@ def compared_distance(result: Calibration) -> float:
 
 
 def tracks(result: Calibration, geometry: Geometry, distance: float) -> list[Track]:
-    """Return the tracks of a calibration with given dimensions, and errors over a distance (m).
-
-    Its time offsets and its sensor are used.
-    """
+    """Return the tracks of a calibration with given dimensions, and errors over a distance (m)."""
     sensor = inverted(result.estimate.sensor)
     found = []
     for segment in result.segments:

@@ -70,15 +70,10 @@ LARGEST = Noise(wheel=1.0, position=1e3, heading=1e2)
 
 
 def solve_block_tridiagonal(diagonal: Array, upper: Array, right: Array) -> tuple[Array, float]:
-    """Solve `A x = b` and compute log det A, infinite or NaN where A is singular.
+    """Return the solution x of `A x = b` and log det A, infinite or NaN where A is singular.
 
-    Args:
-        diagonal: Blocks A[i, i], shape (n, 3, 3).
-        upper: Blocks A[i, i + 1], shape (n - 1, 3, 3).
-        right: b, shape (n, 3, m), as x; m may be 0.
-
-    Raises:
-        numpy.linalg.LinAlgError: A block is exactly singular.
+    The blocks A[i, i] are `diagonal`, shape (n, 3, 3), the blocks A[i, i + 1] are `upper`, and b and x
+    have shape (n, 3, m); m may be 0.
     """
     levels = []
     logarithm = 0.0
@@ -303,9 +298,6 @@ def fit(
     """Return the most likely parameters of continuous motions of at least two poses each.
 
     The prior lies about `anchor` (default: the parameters of `start`).
-
-    Raises:
-        CalibrationError: The estimate does not converge.
     """
     estimate = start
     if not estimate.states:
@@ -356,13 +348,10 @@ def score(
     columns: Sequence[NDArray[np.int_]] | None = None,
     count: int | None = None,
 ) -> tuple[Array, Array]:
-    """Return the information and the gradient of all parameters and of further ones that are 0.
+    """Return the Fisher information and the gradient of all `count` parameters, without the prior.
 
-    `columns` and `count` are as of `linearized`. If poses, noise and parameters are the true ones, the
+    Those of `columns` are 0, see `linearized`. If poses, noise and parameters are the true ones, the
     inverse of the information is the Cramer-Rao bound.
-
-    Returns:
-        Fisher information, shape (count, count), and gradient, shape (count,), without the prior.
     """
     count = count or len(estimate.parameters)
     groups, reading = linearized(segments, nominal, estimate, columns=columns, count=count)

@@ -51,10 +51,7 @@ class InitialEstimate:
     """Pose of the sensor in the body frame, shape (3,)."""
 
     def differences(self, segment: Segment, time_offset: float) -> tuple[Array, Array]:
-        """Return the steps of the reference relative to those that the wheels measure, shape (n - 1, 3).
-
-        And the distance that both wheels travel in each step, shape (n - 1,).
-        """
+        """Return how steps of the reference differ from those of the wheels, and these distances."""
         moved = _moved(segment, self.geometry, time_offset)
         expected = composed(composed(inverted(self.sensor), moved.steps), self.sensor)
         found = relative(segment.poses[:-1], segment.poses[1:])
@@ -68,11 +65,7 @@ def _moved(segment: Segment, geometry: Geometry, offset: float) -> Increments:
 
 
 def initial_estimate(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> InitialEstimate:
-    """Return approximate parameters from continuous motions and the time offset of each recording (s).
-
-    Raises:
-        CalibrationError: The wheels or the reference do not move, or turn in opposite senses.
-    """
+    """Return parameters from continuous motions and the time offset of each recording (s)."""
     parts = [_parts(one, nominal, offsets[one.recording]) for one in segments]
     radii, separation = np.array(nominal.radii), nominal.separation
     angles = np.concatenate([angle for angle, _ in parts])

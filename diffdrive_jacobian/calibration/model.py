@@ -168,8 +168,7 @@ drive determines it."""
 def undetermined(covariance: Array) -> list[tuple[str, str]]:
     """Return the combinations of multipliers that are not determined, and what drive determines them.
 
-    Args:
-        covariance: Of the logarithms of the multipliers (left, right, separation), shape (3, 3).
+    `covariance` is that of the logarithms of the multipliers, shape (3, 3).
     """
     variances, directions = np.linalg.eigh(covariance)
     space = directions[:, variances > UNDETERMINED**2]

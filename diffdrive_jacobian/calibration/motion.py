@@ -78,8 +78,7 @@ def increments(
 
     Args:
         time: Times of the samples of the wheels, increasing, shape (m,) (s).
-        angles: Angles of the right and the left wheel, shape (m, 2) (rad). They are interpolated
-            linearly.
+        angles: Angles of the right and the left wheel there, shape (m, 2) (rad).
         at: Increasing times within those of the wheels, shape (n,), n at least 2 (s).
         geometry: Radii and separation of the wheels.
         window: Half of the time over which `rates` are means, at most the sample period (s).

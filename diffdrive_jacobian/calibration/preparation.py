@@ -19,12 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.calibration.initial_estimate import InitialEstimate
-from diffdrive_jacobian.calibration.model import (
-    Array,
-    CalibrationDrive,
-    CalibrationError,
-    Segment,
-)
+from diffdrive_jacobian.calibration.model import Array, CalibrationDrive, CalibrationError, Segment
 from diffdrive_jacobian.calibration.motion import Geometry
 from diffdrive_jacobian.numerics.elementary import wrap
 
@@ -162,9 +157,6 @@ def overlapping(
 
     `offset` is added to the times of its poses (s). If `smooth`, the speeds of wheels change gradually
     between samples; else they are constant.
-
-    Raises:
-        CalibrationError: There is no time in common.
     """
     wheels, at = recording.wheel_time, recording.pose_time + offset
     inside = (at >= wheels[0]) & (at <= wheels[-1])
@@ -273,11 +265,7 @@ def without(segments: Sequence[Segment], recording: int, begin: float, end: floa
 def without_jumps(
     segments: Sequence[Segment], found: InitialEstimate, offsets: Array, names: Sequence[str]
 ) -> tuple[list[Segment], list[str]]:
-    """Remove glitches of the reference, split motions at its jumps, and return notes of them.
-
-    Raises:
-        CalibrationError: There are too many of them, or too few poses remain.
-    """
+    """Remove glitches of the reference, split motions at its jumps, and return notes of them."""
     kept: list[Segment] = []
     notes: list[str] = []
     poses = glitches = 0

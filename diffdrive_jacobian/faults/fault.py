@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep._injection import Injection
+from diffdrive_jacobian.lockstep._injection import Undo as Undo
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Checked, Name, Text
 
@@ -75,8 +76,6 @@ def brief(value: Any) -> str:
     return literal(value)
 
 
-Undo = Callable[[], None]
-"""Ends what a fault does."""
 Filter = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
 """What a topic fault does with a message.
 
@@ -134,10 +133,7 @@ class Fault(Expression, ABC):
     def reaction_delay(self, node: Node, since: float, now: float) -> float:
         """Return by how much it may have delayed a reaction of the node that it affects (s).
 
-        Args:
-            node: The node.
-            since: World time from which on it could react (s).
-            now: World time of the reaction (s).
+        The node could react from the world time `since` on, and did at `now` (s).
         """
         return 0.0
 
@@ -171,12 +167,7 @@ class TopicFault(Fault):
 
     @abstractmethod
     def begin(self, rng: random.Random, message_type: type) -> Filter:
-        """Return what this fault does with the messages of one subscription.
-
-        Args:
-            rng: Random numbers of this fault for this subscription.
-            message_type: Type of the messages.
-        """
+        """Return what this fault does with the messages of one subscription, with its random numbers."""
 
     def install(self, injection: Injection) -> None:
         """Filter the messages of the topic."""

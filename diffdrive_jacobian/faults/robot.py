@@ -36,11 +36,7 @@ Multiplier = Annotated[float, partial(number, check=between(0.01, 100.0))]
 
 @dataclass(frozen=True, repr=False)
 class RobotFault(Fault):
-    """A fault of a `VirtualRobot`.
-
-    Attributes:
-        robot: Name of its node.
-    """
+    """A fault of a `VirtualRobot`, by the name of its node."""
 
     robot: Name = field(default='virtual_robot', kw_only=True)
 
@@ -86,13 +82,9 @@ class RobotFault(Fault):
 
 @dataclass(frozen=True, repr=False)
 class DeadWheel(RobotFault):
-    """The motor of a wheel is dead: its wheel stands still at once, whatever is commanded.
+    """The motor of a wheel is dead: its wheel, 'left' or 'right', stands still, whatever is commanded.
 
-    A command to drive straight turns the robot about that wheel. The encoders see it, so `odom` and
-    `joint_states` show the true motion.
-
-    Attributes:
-        wheel: 'left' or 'right'.
+    A command to drive straight turns the robot about that wheel, as `odom` and `joint_states` show.
     """
 
     wheel: Wheel
@@ -104,15 +96,10 @@ class DeadWheel(RobotFault):
 
 @dataclass(frozen=True, repr=False)
 class SaturatedWheel(RobotFault):
-    """The motor of a wheel is weak: it does not turn its wheel faster than `max_velocity`.
+    """The motor of a wheel, 'left' or 'right', is weak: it turns at most at `max_velocity` (rad/s).
 
-    The robot does not know, so the path bends to the side of that wheel. Its parameter
-    `max_wheel_velocity`, in contrast, slows both wheels down and keeps the curvature. The encoders see
-    it, so `odom` and `joint_states` show the true motion.
-
-    Attributes:
-        wheel: 'left' or 'right'.
-        max_velocity: Largest speed of the wheel (rad/s).
+    The robot does not know, so the path bends to the side of that wheel, as `odom` and `joint_states`
+    show. Its parameter `max_wheel_velocity`, in contrast, slows both wheels and keeps the curvature.
     """
 
     wheel: Wheel
@@ -127,10 +114,10 @@ class SaturatedWheel(RobotFault):
 class ActuatorLag(RobotFault):
     """The motors lag: the wheel speeds approach the commanded ones with first order.
 
-    Of a step of the command `1 - exp(-t / seconds)` is reached after the time t. The robot stops as
-    slowly after its timeout. The motion is exact. `cmd_vel_out` has the commands, and `/fault_events`
-    the lag: `verify_run` needs both. The encoders see the lag, so `odom` and `joint_states` show the
-    true motion. Of several lags, and the parameter `wheel_lag`, the longest one counts.
+    Of a step of the command `1 - exp(-t / seconds)` is reached after the time t, also of a stop. The
+    motion is exact, and `odom` and `joint_states` show it. `cmd_vel_out` has the commands, and
+    `/fault_events` the lag: `verify_run` needs both. Of several lags, and the parameter `wheel_lag`, the
+    longest one counts.
 
     Attributes:
         seconds: Time constant (s).
@@ -151,15 +138,12 @@ class ActuatorLag(RobotFault):
 
 @dataclass(frozen=True, repr=False)
 class EncoderSteps(RobotFault):
-    """The wheel encoders are coarse: they count whole increments of a turn.
+    """The wheel encoders are coarse: they count whole increments, `per_revolution` in a turn of a wheel.
 
     `odom` is integrated from the counts at each publication, by one exact arc with the distances counted
     since the one before. `joint_states` and the twist in `odom` are what was counted. The motion itself
     is unchanged: `ground_truth` shows it. Each wheel is known to one increment, so the heading in `odom`
     is off by less than `2 r increment / L`. After the fault the odometry goes on from where it is.
-
-    Attributes:
-        per_revolution: Number of increments of a turn of the wheel.
     """
 
     per_revolution: Annotated[int, partial(integer, low=1, high=MAX_PER_REVOLUTION)]
@@ -188,17 +172,12 @@ class Slip(RobotFault):
 
 @dataclass(frozen=True, repr=False)
 class WrongGeometry(RobotFault):
-    """The wheels or their separation differ from what the odometry assumes, or a wheel skids.
+    """The true wheels or their separation differ from what the odometry assumes, or a wheel skids.
 
     `odom` and `joint_states` do not notice. `ground_truth` shows where the robot truly is, also after
-    the fault. The multipliers are those of the parameters `true_left_wheel_radius_multiplier` and so on,
-    and multiply them. A left wheel that skids, and travels half the distance that it turns, has
-    `left_wheel_radius_multiplier=0.5`.
-
-    Attributes:
-        left_wheel_radius_multiplier: True radius of the left wheel, relative to the assumed one [-].
-        right_wheel_radius_multiplier: True radius of the right wheel [-].
-        wheel_separation_multiplier: True wheel separation [-].
+    the fault. The multipliers are relative to the assumed values, and multiply the parameters
+    `true_left_wheel_radius_multiplier` and so on. A left wheel that skids, and travels half the distance
+    that it turns, has `left_wheel_radius_multiplier=0.5`.
     """
 
     left_wheel_radius_multiplier: Multiplier = 1.0
@@ -220,10 +199,9 @@ class WrongGeometry(RobotFault):
 class Push(RobotFault):
     """Somebody pushes the robot, or lifts it elsewhere: its pose is displaced at once, at `start`.
 
-    The displacement is in its own frame: dx forward, dy to the left. The wheels do not turn, so `odom`
-    and `joint_states` do not notice, and `ground_truth` shows it. With `noticed` the odometry is
-    displaced too, as if it was corrected by a localisation, and a new `start_pose` is published. It
-    happens once, and is over then, whatever the duration.
+    The wheels do not turn, so `odom` and `joint_states` do not notice, and `ground_truth` shows it. With
+    `noticed` the odometry is displaced too, as if corrected by a localisation, and a new `start_pose` is
+    published. It happens once, and is over then, whatever the duration.
 
     Attributes:
         dx: Displacement forward (m).

@@ -52,16 +52,14 @@ class Loss(TopicFault):
 
 @dataclass(frozen=True, repr=False)
 class Delay(TopicFault):
-    """Messages arrive late, in the order in which they were published.
+    """Messages arrive late, in the order in which they were published, also just after the fault.
 
-    The delay of a message is `seconds`, plus a random part between 0 and `spread`, plus `growth` for
-    each second since the fault began. A message whose delay would let it overtake an earlier one arrives
-    immediately after that. This holds for the first messages after the fault, too.
+    A message whose delay would let it overtake an earlier one arrives immediately after that.
 
     Attributes:
         seconds: Constant part of the delay (s).
         spread: Largest random part of the delay (s), uniformly distributed.
-        growth: Growth of the delay (s per s).
+        growth: Growth of the delay since the fault began (s per s).
     """
 
     seconds: NotNegative
@@ -82,7 +80,7 @@ class Delay(TopicFault):
 
     @property
     def longest_delay(self) -> float:
-        """Delay at the end of the fault (s). Without growth also one without an end has a longest."""
+        """Delay at the end of the fault (s)."""
         growth = self.growth * self.duration if self.growth else 0.0
         return self.seconds + self.spread + growth
 
@@ -146,13 +144,7 @@ class Duplicate(TopicFault):
 
 @dataclass(frozen=True, repr=False)
 class RateLimit(TopicFault):
-    """At most `rate` messages per second arrive: one that comes too soon after another is lost.
-
-    A message arrives if at least 1/`rate` s have passed since the last one that did.
-
-    Attributes:
-        rate: Largest rate (Hz).
-    """
+    """At most `rate` messages per second arrive: one within 1/`rate` s of the last one is lost."""
 
     rate: Positive
 

@@ -27,11 +27,7 @@ from diffdrive_jacobian.time_units import in_seconds, nanoseconds
 
 @dataclass(frozen=True, repr=False)
 class NodeFault(Fault):
-    """A fault of one node.
-
-    Attributes:
-        node: Name of the node.
-    """
+    """A fault of one node, by its name."""
 
     node: Name
 
@@ -111,16 +107,13 @@ class Hang(NodeFault):
 
 @dataclass(frozen=True, repr=False)
 class Slow(NodeFault):
-    """Each callback of the node takes simulated time.
+    """Each callback of the node takes `seconds` of simulated time.
 
-    What a callback publishes or responds leaves `seconds` after it began. Until then the node is busy:
-    what arrives waits in its queues, of which a full one loses the oldest. Then comes whatever has
-    waited longest, a message, a request or a timer. The callback reads the clock of its beginning.
-    Its requests to services leave at once, and what a coroutine does after its first `await` takes no
-    time. The same holds for timers on wall time.
-
-    Attributes:
-        seconds: Duration of each callback (s).
+    What it publishes or responds leaves that long after it began. Until then the node is busy: what
+    arrives waits in its queues, of which a full one loses the oldest. Then comes whatever has waited
+    longest, a message, a request or a timer. The callback reads the clock of its beginning. Its requests
+    to services leave at once, and what a coroutine does after its first `await` takes no time. The same
+    holds for timers on wall time.
     """
 
     seconds: Positive
@@ -156,12 +149,9 @@ class Slow(NodeFault):
 
 @dataclass(frozen=True, repr=False)
 class TimerJitter(NodeFault):
-    """Each tick of the node's timers comes late, by a random time between 0 and `seconds`.
+    """Each tick of the node's timers comes late, by up to `seconds`, uniformly distributed.
 
     The ticks after it are not shifted. A tick that is more than a period late replaces those between.
-
-    Attributes:
-        seconds: Longest delay (s), uniformly distributed.
     """
 
     seconds: Positive
@@ -294,10 +284,9 @@ class LateService(Fault):
 class ParameterChange(NodeFault):
     """Somebody changes a parameter of a node, and changes it back after `duration`.
 
-    If another change of it began meanwhile and still lasts, that one remains until its own end.
-
-    The node may refuse the value, which is noted in the events. It is an error if it has no such
-    parameter.
+    If another change of it began meanwhile and still lasts, that one remains until its own end, and the
+    value is then as before both. That the node refuses the value is noted in the events. It is an error
+    if it has no such parameter.
 
     Attributes:
         name: Name of the parameter.
@@ -308,10 +297,7 @@ class ParameterChange(NodeFault):
     value: Annotated[Any, _parameter_value]
 
     def install(self, injection: Injection) -> None:
-        """Change the parameter when the fault begins, and back when it ends.
-
-        While a later change of it lasts, that one remains, and at its end the value is as before both.
-        """
+        """Change the parameter when the fault begins, and back when it ends."""
         gate, world = injection.gate(self.node), injection.world
         # The parameters that are changed now, the earliest change first.
         changes: list[_Change] = world.shared[f'parameters of {gate.name}']
@@ -353,7 +339,7 @@ class ParameterChange(NodeFault):
         injection.during(begin)
 
     def _set(self, injection: Injection, node: Node, value: Any) -> Any:
-        """Set the parameter. Return its value before; None: the node refused it, or it had none."""
+        """Return the value before it was set; None: it is refused, or there was none."""
         if not node.has_parameter(self.name):
             declared = sorted(declared_parameters(node))
             known = ', '.join(one for one in declared if not one.startswith(PARAMETERS_OF_RCLPY))

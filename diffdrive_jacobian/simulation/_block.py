@@ -20,14 +20,7 @@ from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import Controller, Law
 from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
-from diffdrive_jacobian.numerics.checks import (
-    array,
-    floats,
-    function,
-    leading,
-    number,
-    positive,
-)
+from diffdrive_jacobian.numerics.checks import array, floats, function, leading, number, positive
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.numerics.fields import instance, optional
 from diffdrive_jacobian.simulation._following import Follower
@@ -61,10 +54,7 @@ class Outcomes(NamedTuple):
 
 
 class Batch:
-    """The arguments of a batch, checked and flattened.
-
-    Values that are equal for all robots are numbers, others have a first axis of robots.
-    """
+    """The checked arguments. Those equal for all robots are numbers, others have an axis of robots."""
 
     def __init__(
         self,

@@ -181,11 +181,7 @@ def _integrals(
     rest: Array | None,
     tau: float,
 ) -> tuple[Array, Array]:
-    """Integrate the twists `speed + slope t + rest exp(-t / tau)` over a step.
-
-    Returns:
-        As `Follower.steps` yields it.
-    """
+    """Integrate `speed + slope t + rest exp(-t / tau)` over a step, as `Follower.steps` yields it."""
     dx, dy = np.zeros_like(seconds), np.zeros_like(seconds)
     sums: Array = np.zeros((3, len(seconds)))
 

@@ -161,11 +161,7 @@ class Uncertainty:
         return later
 
     def moments(self) -> Entries:
-        """Return the entries of the moments.
-
-        Raises:
-            ValueError: They overflow.
-        """
+        """Return the entries of the moments; ValueError if they overflow."""
         moments = self._moments
         if moments is None:
             self._evaluate()

@@ -38,11 +38,7 @@ class Encoders:
 
     @classmethod
     def at(cls, robot: Robot, per_revolution: int) -> Encoders:
-        """Return encoders that are read for the first time.
-
-        Raises:
-            ValueError: `per_revolution` is not an integer from 1 to `MAX_PER_REVOLUTION`.
-        """
+        """Return encoders that are read for the first time; ValueError: `per_revolution` is invalid."""
         per_revolution = integer('per_revolution', per_revolution, 1, MAX_PER_REVOLUTION)
         counts = _counts(robot.wheel_angles, per_revolution)
         return cls(per_revolution, robot.stamp, counts, robot.pose_tuple)

@@ -152,13 +152,7 @@ def series(alpha: float, turn: float, nu: float, beta: float, m: float) -> Noise
 
 
 def _real(
-    first: complex,
-    turned: complex,
-    a: complex,
-    b: complex,
-    square: float,
-    nu: float,
-    rest: complex,
+    first: complex, turned: complex, a: complex, b: complex, square: float, nu: float, rest: complex
 ) -> NoiseMoments:
     """Return the real moments of complex ones; `a` is E[gamma (h - 1)], `b` is E[gamma* (h - 1)]."""
     return NoiseMoments(

@@ -190,11 +190,7 @@ class SweepSetup(Checked):
 
 
 def _gain_value(name: str, value: object) -> float | tuple[float, float]:
-    """Return a gain, or its range, as floats.
-
-    Raises:
-        ValueError: It is something else.
-    """
+    """Return a gain, or its range, as floats."""
     made = array(name, value)
     if made.shape not in ((), (2,)):
         raise ValueError(f'{name} must be a number or (MIN, MAX), got {short(value)}')
@@ -335,11 +331,7 @@ def _drive_on(
 
 
 def _check_law(controller: Controller, starts: Array, goal: Array, gains: list[Any]) -> None:
-    """Evaluate a law once for all starts.
-
-    Raises:
-        ValueError: It raises an exception; laws for single poses do so when they are given arrays.
-    """
+    """Evaluate a law once for all starts, which those for single poses do not accept."""
     first = [float(np.ravel(gain)[0]) for gain in gains]
     goals = np.broadcast_to(goal, (len(starts), len(goal)))
     more: dict[str, Any] = {}

@@ -43,10 +43,7 @@ def twist_covariance(twist: Vector, L: Number, wheel_travel_variance: Number, in
     """
     v, omega = twist
     vv, vw, ww = spectral_densities(v, omega, L, wheel_travel_variance)
-    return [
-        [vv / interval, vw / interval],
-        [vw / interval, ww / interval],
-    ]
+    return [[vv / interval, vw / interval], [vw / interval, ww / interval]]
 
 
 def spectral_densities(v: Number, omega: Number, L: Number, k: Number) -> tuple[Number, Number, Number]:
@@ -63,12 +60,7 @@ def spectral_densities(v: Number, omega: Number, L: Number, k: Number) -> tuple[
     wheel_travel_variance=not_negative,
 )
 def propagate_covariance(
-    covariance: Vector,
-    pose: Vector,
-    twist: Vector,
-    dt: Number,
-    L: Number,
-    wheel_travel_variance: Number,
+    covariance: Vector, pose: Vector, twist: Vector, dt: Number, L: Number, wheel_travel_variance: Number
 ) -> Rows:
     """Propagate the covariance of a pose along an arc.
 
@@ -134,11 +126,7 @@ def _noise_at_end(v: Number, omega: Number, dt: Number, L: Number, k: Number) ->
 
 
 def covariance_of_pose(name: str, covariance: ArrayLike) -> NDArray[np.float64]:
-    """Return the covariance of one pose as an array, shape (3, 3).
-
-    Raises:
-        ValueError: The shape, an entry that is not finite, or not symmetric and positive semidefinite.
-    """
+    """Return the covariance of one pose, shape (3, 3), symmetric and positive semidefinite."""
     made = array(name, covariance, 3, 3)
     if made.ndim != 2:
         raise ValueError(f'{name} must have shape (3, 3), got {made.shape}')

@@ -504,11 +504,7 @@ def _robot(
 
 
 def _triple(name: str, value: ArrayLike) -> Pose:
-    """Return three finite numbers as a tuple of floats.
-
-    Raises:
-        ValueError: It is something else.
-    """
+    """Return three finite numbers as a tuple of floats."""
     x, y, theta = numbers(name, value, 3)
     return x, y, theta
 

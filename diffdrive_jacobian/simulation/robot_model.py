@@ -11,11 +11,7 @@ from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
-from diffdrive_jacobian.numerics.checks import (
-    NotNegative,
-    Positive,
-    numbers,
-)
+from diffdrive_jacobian.numerics.checks import NotNegative, Positive, numbers
 from diffdrive_jacobian.numerics.fields import Checked, instance, optional
 from diffdrive_jacobian.simulation.actuators import Actuators, Duration, Speeds
 from diffdrive_jacobian.simulation.slip import Drift
@@ -122,11 +118,7 @@ class RobotModel(Checked):
 
 
 def pair(name: str, value: Any) -> tuple[float, float]:
-    """Return two finite numbers as a tuple of floats.
-
-    Raises:
-        ValueError: It is something else.
-    """
+    """Return two finite numbers as a tuple of floats."""
     if type(value) is tuple and len(value) == 2:
         first, second = value
         # A finite sum has finite terms.

@@ -114,11 +114,7 @@ class Truth:
         return self if self._held is None else Truth(self._drift, self.pose)
 
     def after(self, start: int, stamp: int, twist: tuple[float, float], L: float, k: float) -> Truth:
-        """Return the truth after a nominal twist from `start`, the time of this value, to `stamp` (ns).
-
-        Raises:
-            ValueError: The motion overflows.
-        """
+        """Return the truth after a nominal twist from `start`, the present time, to `stamp` (ns)."""
         drift = self._drift
         right, left, separation = self._wheels(twist, L)
         if drift.seed is None or not k:
@@ -158,9 +154,6 @@ class Truth:
 
         In a cell a wheel slips at a constant speed from one piece of the motion to the next, such that
         at the end of the piece what was slipped has the variance of the distance so far.
-
-        Raises:
-            ValueError: The motion overflows.
         """
         # From the first cell on in which the twist is constant, as if it was commanded there.
         settled = max(begin, (motion.settled_at // CELL + 1) * CELL)
@@ -288,10 +281,7 @@ def _gain(a: float, variance: float, growth: float, rest: float) -> float:
 
 
 def normals(seed: int, level: int, cell: int) -> tuple[float, float]:
-    """Return the standard normal numbers of the right and the left wheel in a cell.
-
-    Its width is `CELL << level`, and its start is `cell` times that.
-    """
+    """Return the numbers xi of the right and the left wheel in the cell of width `CELL << level`."""
     block, place = divmod(cell, _BLOCK)
     return _block(seed, level, block)[place]
 

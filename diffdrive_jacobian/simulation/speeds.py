@@ -244,11 +244,7 @@ def moved(pose: tuple[float, float, float], piece: Piece) -> tuple[float, float,
 def displaced(
     pose: tuple[float, float, float], displacement: tuple[float, float, float]
 ) -> tuple[float, float, float]:
-    """Return the pose after a displacement in its body frame.
-
-    Raises:
-        ValueError: It overflows.
-    """
+    """Return the pose after a displacement in its body frame; ValueError if it overflows."""
     (x, y, theta), (dx, dy, turn) = pose, displacement
     c, s = cos(theta), sin(theta)
     x, y = x + c * dx - s * dy, y + s * dx + c * dy
@@ -296,11 +292,7 @@ def rolled(course: Course, piece: Piece, seconds: float) -> float:
 def arc_end(
     x: float, y: float, theta: float, v: float, omega: float, dt: float
 ) -> tuple[float, float, float]:
-    """Return the pose `se2.integrate` of finite floats, for what runs with every message.
-
-    Raises:
-        ValueError: The result overflows.
-    """
+    """Return `se2.integrate` of finite floats, for every message; ValueError if it overflows."""
     try:
         end_x, end_y, end_theta = integrate.formula((x, y, theta), (v, omega), dt)
         if isfinite(end_x) and isfinite(end_y) and isfinite(end_theta):

@@ -197,11 +197,7 @@ def _check_callables(robot: Manipulator, secondary: object) -> None:
 
 
 def _inputs(
-    robot: Manipulator,
-    secondary: Callable[[Array], ArrayLike],
-    q: Array,
-    inputs: int,
-    W_half: Array,
+    robot: Manipulator, secondary: Callable[[Array], ArrayLike], q: Array, inputs: int, W_half: Array
 ) -> Array:
     """Compute the secondary task's inputs, shape (..., inputs)."""
     task = array('result of secondary', secondary(q), 'n')

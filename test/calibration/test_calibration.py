@@ -569,9 +569,7 @@ def test_faults_are_named(what, words):
 def test_wheels_at_a_low_rate_and_slip_are_noted():
     recording = base()
     rare = replace(
-        recording,
-        wheel_time=recording.wheel_time[::50],
-        wheel_angles=recording.wheel_angles[::50],
+        recording, wheel_time=recording.wheel_time[::50], wheel_angles=recording.wheel_angles[::50]
     )
     assert any('every 1 s' in note for note in calibrate([rare], NOMINAL).notes)
     slips = replace(ROBOT, noise=replace(NOISE, wheel=2e-3)).recording(np.random.default_rng(13))
@@ -587,9 +585,7 @@ def test_only_the_time_in_common_counts(overlap):
     else:
         late = recording.wheel_time > 15.0
         one = replace(
-            recording,
-            wheel_time=recording.wheel_time[late],
-            wheel_angles=recording.wheel_angles[late],
+            recording, wheel_time=recording.wheel_time[late], wheel_angles=recording.wheel_angles[late]
         )
     result = calibrate([one], NOMINAL)
     assert_true(result)

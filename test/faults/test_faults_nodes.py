@@ -42,12 +42,7 @@ def test_a_killed_node_stops_at_once_and_is_made_again(lockstep, relay):
     # Timers that are created before the first /clock tick at multiples of their period.
     assert again.ticks == [650.0, 700.0, 800.0, 900.0, 1000.0]
     assert relay.sink.numbers == [1, 2, 3, 7, 8, 9, 10]
-    assert whats(lockstep) == [
-        'begins',
-        '/relay is killed',
-        '/relay is started again',
-        'ends',
-    ]
+    assert whats(lockstep) == ['begins', '/relay is killed', '/relay is started again', 'ends']
     with pytest.raises(Exception, match='destruction'):
         relay.publisher.publish(Int64())
 
@@ -134,10 +129,7 @@ HELD = {
         [100.0, 200.0, 550.0, 600.0, 700.0, 800.0, 900.0],
     ),
     'frozen twice': (
-        [
-            faults.Hang('relay', start=0.15, duration=0.3),
-            faults.Hang('relay', start=0.3, duration=0.45),
-        ],
+        [faults.Hang('relay', start=0.15, duration=0.3), faults.Hang('relay', start=0.3, duration=0.45)],
         [*in_time(1, 1), *at(750.0, 2, 3, 4, 5, 6, 7), *in_time(8, 9)],
         [100.0, 750.0, 800.0, 900.0],
     ),

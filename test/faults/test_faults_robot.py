@@ -281,8 +281,7 @@ def test_a_motor_dies_under_a_command_that_is_held_and_lives_again(lockstep, rob
     assert instants(topics.applied) == [SECOND, 2 * SECOND, 5 * SECOND // 2]
     turned = 0.2 / L * 0.5
     expected = compose(
-        integrate(integrate((0.0, 0.0, 0.0), (0.2, 0.0), 1.0), (0.1, 0.2 / L), 0.5),
-        (0.1, 0.0, 0.0),
+        integrate(integrate((0.0, 0.0, 0.0), (0.2, 0.0), 1.0), (0.1, 0.2 / L), 0.5), (0.1, 0.0, 0.0)
     )
     close(pose_of(topics.odom[-1]), expected, 1e-9)
     close(robot.truth, expected, 1e-9)
