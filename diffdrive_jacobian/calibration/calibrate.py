@@ -330,7 +330,7 @@ def _estimated(
         motions = [one for one in motions if len(one.time) > 1]
         if not motions:
             raise CalibrationError('the wheels never turn')
-        estimate = fit(motions, nominal, replace(estimate, states=()), given, start.parameters)
+        estimate = fit(motions, nominal, estimate, given, start.parameters)
         if np.abs(estimate.parameters[TIME_OFFSETS:] - before).max() < 1e-3:
             break
     return estimate, motions

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,27 +135,114 @@ class Group:
         return max(0.0, self.cost + linear + square)
 
 
-Groups: TypeAlias = tuple[Group, Group, Group]
-"""Of the motion, the positions and the headings."""
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Solution:
+    """A Gauss-Newton step."""
+
+    step: Array
+    observed: Array
+    """Step of the poses as the reference observes them, which differ by the reading errors."""
+    change: Array
+    """Of the free parameters."""
+    information: Array
+    logarithm: float
+    """log det of the normal matrix."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Equations:
+    """The normal equations of all residuals, and of the prior of the parameters."""
+
+    groups: tuple[Group, Group, Group]
+    """Of the motion, the positions and the headings."""
+    reading: Array
+    """How far the reading errors of both wheels, each of one standard deviation, seem to move the body
+    at each pose: twists in its frame, shape (n, 3, 2)."""
+    free: NDArray[np.bool_]
+    """Which of the parameters are estimated."""
+    pull: Array
+    """Gradient of the prior of all parameters."""
+
+    def solved(self, weights: Array) -> Solution:
+        """Return the Gauss-Newton step for given weights of the groups."""
+        free = self.free
+
+        def total(name: str, kinds: Sequence[int] = (0, 1, 2)) -> Array:
+            return np.asarray(sum(weights[kind] * getattr(self.groups[kind], name) for kind in kinds))
+
+        def right_side(kinds: Sequence[int] = (0, 1, 2)) -> Array:
+            border, gradient = total('border', kinds)[:, :, free], total('gradient', kinds)
+            return np.concatenate([border, gradient[:, :, None]], axis=2)
+
+        diagonal, right = total('diagonal'), right_side()
+        # The reading errors, with a prior of unit weight, act on the reference only. They are eliminated.
+        at = np.flatnonzero(self.reading.any(axis=(1, 2)))
+        B, H, b = self.reading[at], total('diagonal', (1, 2))[at], right_side((1, 2))[at]
+        back = np.swapaxes(B, 1, 2)
+        inner = np.eye(2) + back @ H @ B
+        G = B @ np.linalg.solve(inner, back)
+        diagonal[at] -= H @ G @ H
+        right[at] -= H @ G @ b
+        solved, logarithm = solve_block_tridiagonal(diagonal, total('upper'), right)
+        eliminated = np.tensordot(right[:, :, :-1], solved, ((0, 1), (0, 1)))
+        eliminated += np.tensordot(b[:, :, :-1], G @ b, ((0, 1), (0, 1)))
+        information = total('corner')[np.ix_(free, free)] - eliminated[:, :-1]
+        information = (information + information.T) / 2.0
+        damped = information + np.diag(prior_deviations(len(free))[free] ** -2.0)
+        change = -np.linalg.solve(
+            damped, total('gradient_corner')[free] + self.pull[free] - eliminated[:, -1]
+        )
+        step = -solved[:, :, -1] - solved[:, :, :-1] @ change
+        observed = step.copy()
+        observed[at] -= (G @ (H @ step[at, :, None] + b @ np.append(change, 1.0)[:, None]))[:, :, 0]
+        if not (np.isfinite(change).all() and np.isfinite(step).all()):
+            raise CalibrationError(
+                'the estimate diverges: the poses do not fit the motion of the wheels'
+            )
+        return Solution(
+            step=step,
+            observed=observed,
+            change=np.asarray(change, dtype=np.float64),
+            information=information,
+            logarithm=logarithm
+            + float(np.linalg.slogdet(inner)[1].sum() + np.linalg.slogdet(damped)[1]),
+        )
+
+    def freedom_and_costs(self, weights: Array, solution: Solution) -> tuple[Array, Array]:
+        """Return the degrees of freedom of the residuals of each group, and their sums of squares."""
+        change = np.zeros(len(self.free))
+        change[self.free] = solution.change
+        steps = (solution.step, solution.observed, solution.observed)
+        costs = np.array(
+            [one.cost_after(step, change) for one, step in zip(self.groups, steps, strict=True)]
+        )
+        counts = np.array([one.count for one in self.groups])
+        # The estimate takes from each group what log det of the normal matrix changes with its weight.
+        h = 1e-3
+        shifts = weights * np.exp(h * np.eye(3))
+        logarithms = np.array([self.solved(shifted).logarithm for shifted in shifts])
+        used = (logarithms - solution.logarithm) / h
+        freedom = np.maximum(counts - used, 1e-3 * counts)
+        freedom[0] += PRIOR_FREEDOM
+        costs[0] += PRIOR_FREEDOM * PRIOR_WHEEL_NOISE
+        return freedom, costs
 
 
 def linearized(
     segments: Sequence[Segment],
     nominal: Geometry,
     estimate: Estimate,
+    free: NDArray[np.bool_],
+    pull: Array,
     window: float = np.inf,
     columns: Sequence[NDArray[np.int_]] | None = None,
-    count: int | None = None,
-) -> tuple[Groups, Array]:
-    """Return the normal equations of all residuals.
+) -> Equations:
+    """Return the normal equations at an estimate, with rates over a window as of `increments`.
 
-    And how far the reading errors of both wheels, each of one standard deviation, seem to move the body
-    at each pose: twists in its frame, shape (n, 3, 2).
-
-    `columns` are where, among `count` parameters in all, changes of the logarithms of the multipliers
-    begin that are those of single steps, shape (n - 1, any) for each motion (default: there are none).
+    `columns` are where, among all parameters, changes of the logarithms of the multipliers begin that
+    are those of single steps, shape (n - 1, any) for each motion (default: there are none).
     """
-    count = count or len(estimate.parameters)
+    count = len(free)
     if columns is None:
         columns = [np.empty((len(one.time) - 1, 0), dtype=int) for one in segments]
     geometry, sensor = estimate.geometry(nominal), estimate.sensor
@@ -175,7 +261,8 @@ def linearized(
         errors = [np.interp(at, segment.wheel_time, one) for one in segment.wheel_errors.T]
         readings.append(by_reading * np.column_stack(errors)[:, None])
     motion, position, heading = (_joined(part) for part in parts)
-    return (motion, position, heading), np.concatenate(readings)
+    groups = motion, position, heading
+    return Equations(groups=groups, reading=np.concatenate(readings), free=free, pull=pull)
 
 
 def _motion(
@@ -262,32 +349,6 @@ def _joined(parts: Sequence[Group]) -> Group:
     )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Prior:
-    """Which parameters are free, the gradient of their prior, and that of the reading errors."""
-
-    free: NDArray[np.bool_]
-    pull: Array
-    reading: Array
-    """What reading errors of one standard deviation do at each pose, as of `linearized`."""
-
-    @property
-    def misread(self) -> NDArray[np.intp]:
-        """Indices of the poses with reading errors."""
-        return np.flatnonzero(self.reading.any(axis=(1, 2)))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Solution:
-    step: Array
-    observed: Array
-    """Step of the poses as the reference observes them, which differ by the reading errors."""
-    change: Array
-    information: Array
-    logarithm: float
-    """log det of the normal matrix."""
-
-
 def fit(
     segments: Sequence[Segment],
     nominal: Geometry,
@@ -299,20 +360,17 @@ def fit(
 
     The prior lies about `anchor` (default: the parameters of `start`).
     """
-    estimate = start
-    if not estimate.states:
-        sensor = inverted(estimate.sensor)
-        estimate = replace(estimate, states=tuple(composed(one.poses, sensor) for one in segments))
+    sensor = inverted(start.sensor)
+    estimate = replace(start, states=tuple(composed(one.poses, sensor) for one in segments))
     ends = np.cumsum([len(one) for one in estimate.states])[:-1]
     anchor = start.parameters if anchor is None else anchor
     scales = prior_deviations(len(anchor))
     window = np.inf
     tolerances = np.where(np.arange(len(anchor)) < TIME_OFFSETS, CONVERGED, TIME_CONVERGED)[start.free]
     for count in range(MAX_STEPS):
-        groups, reading = linearized(segments, nominal, estimate, window)
         pull = (estimate.parameters - anchor) / scales**2
-        prior = _Prior(free=estimate.free, pull=pull, reading=reading)
-        noise, solution, settled = _with_noise(groups, estimate.noise, given, prior)
+        equations = linearized(segments, nominal, estimate, estimate.free, pull, window)
+        noise, solution, settled = _with_noise(equations, estimate.noise, given)
         size = np.abs(solution.change)
         window = WINDOW * float(size[np.count_nonzero(estimate.free[:TIME_OFFSETS]) :].max(initial=0.0))
         limit = scales[estimate.free]
@@ -337,7 +395,7 @@ def fit(
                 'do not fit the motion of the wheels'
             )
     if given.wheel_noise is None:
-        estimate = replace(estimate, information=_averaged(groups, noise, prior))
+        estimate = replace(estimate, information=_averaged(equations, noise))
     return estimate
 
 
@@ -354,9 +412,9 @@ def score(
     inverse of the information is the Cramer-Rao bound.
     """
     count = count or len(estimate.parameters)
-    groups, reading = linearized(segments, nominal, estimate, columns=columns, count=count)
-    prior = _Prior(free=np.ones(count, dtype=bool), pull=np.zeros(count), reading=reading)
-    found = _solved(groups, _weights(estimate.noise), prior)
+    free, pull = np.ones(count, dtype=bool), np.zeros(count)
+    equations = linearized(segments, nominal, estimate, free, pull, columns=columns)
+    found = equations.solved(_weights(estimate.noise))
     damped = found.information + np.diag(prior_deviations(count) ** -2.0)
     return found.information, -damped @ found.change
 
@@ -365,52 +423,7 @@ def _weights(noise: Noise) -> Array:
     return 1.0 / np.array([noise.wheel, noise.position**2, noise.heading**2])
 
 
-def _solved(groups: Groups, weights: Array, prior: _Prior) -> _Solution:
-    """Return the Gauss-Newton step for given weights of the groups."""
-    free = prior.free
-
-    def total(name: str, kinds: Sequence[int] = (0, 1, 2)) -> Array:
-        return np.asarray(sum(weights[kind] * getattr(groups[kind], name) for kind in kinds))
-
-    def right_side(kinds: Sequence[int] = (0, 1, 2)) -> Array:
-        border, gradient = total('border', kinds)[:, :, free], total('gradient', kinds)
-        return np.concatenate([border, gradient[:, :, None]], axis=2)
-
-    diagonal, right = total('diagonal'), right_side()
-    # The reading errors, with a prior of unit weight, act on the reference only. They are eliminated.
-    at = prior.misread
-    B, H, b = prior.reading[at], total('diagonal', (1, 2))[at], right_side((1, 2))[at]
-    back = np.swapaxes(B, 1, 2)
-    inner = np.eye(2) + back @ H @ B
-    G = B @ np.linalg.solve(inner, back)
-    diagonal[at] -= H @ G @ H
-    right[at] -= H @ G @ b
-    solved, logarithm = solve_block_tridiagonal(diagonal, total('upper'), right)
-    eliminated = np.tensordot(right[:, :, :-1], solved, ((0, 1), (0, 1)))
-    eliminated += np.tensordot(b[:, :, :-1], G @ b, ((0, 1), (0, 1)))
-    information = total('corner')[np.ix_(free, free)] - eliminated[:, :-1]
-    information = (information + information.T) / 2.0
-    damped = information + np.diag(prior_deviations(len(free))[free] ** -2.0)
-    change = -np.linalg.solve(
-        damped, total('gradient_corner')[free] + prior.pull[free] - eliminated[:, -1]
-    )
-    step = -solved[:, :, -1] - solved[:, :, :-1] @ change
-    observed = step.copy()
-    observed[at] -= (G @ (H @ step[at, :, None] + b @ np.append(change, 1.0)[:, None]))[:, :, 0]
-    if not (np.isfinite(change).all() and np.isfinite(step).all()):
-        raise CalibrationError('the estimate diverges: the poses do not fit the motion of the wheels')
-    return _Solution(
-        step=step,
-        observed=observed,
-        change=np.asarray(change, dtype=np.float64),
-        information=information,
-        logarithm=logarithm + float(np.linalg.slogdet(inner)[1].sum() + np.linalg.slogdet(damped)[1]),
-    )
-
-
-def _with_noise(
-    groups: Groups, noise: Noise, given: Given, prior: _Prior
-) -> tuple[Noise, _Solution, bool]:
+def _with_noise(equations: Equations, noise: Noise, given: Given) -> tuple[Noise, Solution, bool]:
     """Return more likely noise at a linearization, the step for it, and whether it is the most likely.
 
     At the maximum of the restricted likelihood the weighted squares of each group equal its degrees of
@@ -426,11 +439,11 @@ def _with_noise(
         )
     )
     least, most = _weights(LARGEST), _weights(SMALLEST)
-    solution = _solved(groups, weights, prior)
+    solution = equations.solved(weights)
     before: tuple[Array, Array] | None = None
     settled = not unknown.any()
     for _ in range(MAX_NOISE_STEPS if unknown.any() else 0):
-        freedom, costs = _freedom_and_costs(groups, weights, prior, solution)
+        freedom, costs = equations.freedom_and_costs(weights, solution)
         proposed = np.clip(freedom / np.maximum(costs, 1e-300), least, most)
         now, change = np.log(weights), np.where(unknown, np.log(proposed / weights), 0.0)
         target = now + change
@@ -441,7 +454,7 @@ def _with_noise(
             target = target - share * (target - before[0] - before[1])
         before = now, change
         weights = np.clip(np.exp(target), least, most)
-        solution = _solved(groups, weights, prior)
+        solution = equations.solved(weights)
         settled = bool(np.abs(change).max() < NOISE_CONVERGED)
         if settled:
             break
@@ -449,7 +462,7 @@ def _with_noise(
     return Noise(wheel=wheel, position=position**0.5, heading=heading**0.5), solution, settled
 
 
-def _averaged(groups: Groups, noise: Noise, prior: _Prior) -> Array:
+def _averaged(equations: Equations, noise: Noise) -> Array:
     """Return the information of which the inverse is the covariance for uncertain wheel noise.
 
     It is the mean over the posterior of the logarithm of the wheel travel variance, taken as Gaussian,
@@ -457,20 +470,20 @@ def _averaged(groups: Groups, noise: Noise, prior: _Prior) -> Array:
     """
     weights = _weights(noise)
 
-    def at(shift: float) -> tuple[_Solution, Array]:
+    def at(shift: float) -> tuple[Solution, Array]:
         shifted = weights * [np.exp(shift), 1.0, 1.0]
-        return _solved(groups, shifted, prior), shifted
+        return equations.solved(shifted), shifted
 
     def slope(shift: float) -> float:
         """Return twice the derivative of the log likelihood with respect to the log of the weight."""
         solution, shifted = at(shift)
-        freedom, cost = _freedom_and_costs(groups, shifted, prior, solution)
+        freedom, cost = equations.freedom_and_costs(shifted, solution)
         return float(freedom[0] - shifted[0] * cost[0])
 
     h = 0.3
     curvature = (slope(-h) - slope(h)) / (2.0 * h) / 2.0
     width = min(WIDEST, max(curvature, 1e-9) ** -0.5)
-    scales = prior_deviations(len(prior.free))[prior.free] ** -2.0
+    scales = prior_deviations(len(equations.free))[equations.free] ** -2.0
     found = [at(sign * 3.0**0.5 * width)[0] for sign in (-1.0, 0.0, 1.0)]
     shares = np.array([1.0, 4.0, 1.0]) / 6.0
     changes = np.array([one.change for one in found])
@@ -480,23 +493,3 @@ def _averaged(groups: Groups, noise: Noise, prior: _Prior) -> Array:
         for share, one, change in zip(shares, found, off, strict=True)
     )
     return np.asarray(np.linalg.inv(covariance) - np.diag(scales))
-
-
-def _freedom_and_costs(
-    groups: Groups, weights: Array, prior: _Prior, solution: _Solution
-) -> tuple[Array, Array]:
-    """Return the degrees of freedom of the residuals of each group, and their sums of squares."""
-    change = np.zeros(len(prior.free))
-    change[prior.free] = solution.change
-    steps = (solution.step, solution.observed, solution.observed)
-    costs = np.array([one.cost_after(step, change) for one, step in zip(groups, steps, strict=True)])
-    counts = np.array([one.count for one in groups])
-    # The estimate takes from each group what log det of the normal matrix changes with its weight.
-    h = 1e-3
-    shifts = weights * np.exp(h * np.eye(3))
-    logarithms = np.array([_solved(groups, shifted, prior).logarithm for shifted in shifts])
-    used = (logarithms - solution.logarithm) / h
-    freedom = np.maximum(counts - used, 1e-3 * counts)
-    freedom[0] += PRIOR_FREEDOM
-    costs[0] += PRIOR_FREEDOM * PRIOR_WHEEL_NOISE
-    return freedom, costs

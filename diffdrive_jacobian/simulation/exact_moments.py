@@ -148,25 +148,13 @@ def series(alpha: float, turn: float, nu: float, beta: float, m: float) -> Noise
         sums = tuple(map(add, sums, terms))
         c, c4, straight = -m * c / n, -4.0 * m * c4 / n, 0j
     first, turned, a, b, square, rest = sums
-    return _real(first, turned, a - first, b - first.conjugate(), square, nu, rest)
-
-
-def _real(
-    first: complex, turned: complex, a: complex, b: complex, square: float, nu: float, rest: complex
-) -> NoiseMoments:
-    """Return the real moments of complex ones; `a` is E[gamma (h - 1)], `b` is E[gamma* (h - 1)]."""
+    # Half the sum and half the difference of E[gamma (h - 1)] and E[gamma* (h - 1)].
+    a, b = a - first, b - first.conjugate()
+    even, odd = 0.5 * (a + b), 0.5 * (a - b)
+    xx, xy, yy = nu + 0.5 * (square - rest.real), -0.5 * rest.imag, 0.5 * (square + rest.real)
     return NoiseMoments(
-        first.real,
-        first.imag,
-        nu + 0.5 * (square - rest.real),
-        -0.5 * rest.imag,
-        0.5 * (square + rest.real),
-        turned.real,
-        turned.imag,
-        0.5 * (a.real + b.real),
-        0.5 * (a.imag + b.imag),
-        0.5 * (a.imag - b.imag),
-        0.5 * (b.real - a.real),
+        *(first.real, first.imag, xx, xy, yy, turned.real, turned.imag),
+        *(even.real, even.imag, odd.imag, -odd.real),
     )
 
 

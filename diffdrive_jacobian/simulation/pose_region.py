@@ -92,7 +92,7 @@ def sampled_errors(
         draws = rng.normal(size=(count, 2)) @ _root(np.array([[vv, vw], [vw, ww]]))
         bent = turn + draws[:, 1]
         # The arc of the disturbed twist from the true heading, in complex numbers.
-        heading = np.exp(1j * (before[2] + turned + bent / 2.0)) * _chord(bent)
+        heading = np.exp(1j * (before[2] + turned + bent / 2.0)) * np.sinc(bent / (2.0 * np.pi))
         moved = (along + draws[:, 0] + 1j * across) * heading
         dx, dy = (after[:2] - before[:2]).tolist()
         x, y, turned = x + moved.real - dx, y + moved.imag - dy, turned + draws[:, 1]
@@ -201,18 +201,6 @@ def _least(values: Array) -> Array:
     inside = (middle == place) & (bent > 0.0) & np.isfinite(lower)
     refined: Array = np.where(inside, lower, least)
     return refined
-
-
-def _chord(turns: Array) -> Array:
-    """Return the ratios of chord and arc of turns (rad), to 5e-11."""
-    ratio: Array
-    if np.abs(turns).max(initial=0.0) > 0.5:
-        ratio = np.asarray(np.sinc(turns / (2.0 * np.pi)), dtype=np.float64)
-        return ratio
-    square = turns * turns
-    # The Taylor series takes a tenth of the time.
-    ratio = 1.0 - square / 24.0 * (1.0 - square / 80.0 * (1.0 - square / 168.0))
-    return ratio
 
 
 def _root(covariance: Array) -> Array:

@@ -20,7 +20,6 @@ from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_mome
 from diffdrive_jacobian.simulation.pose_region import (
     ELLIPSE_LEVEL,
     Region,
-    _chord,
     log_about,
     region_distance,
     region_of,
@@ -62,12 +61,6 @@ def test_drawn_runs_have_the_exact_second_moment():
     deviations = np.sqrt(np.diag(moments.second_moment))
     # The standard error of an entry is sqrt(2 / 4000) of the deviations' product.
     assert np.all(np.abs(second - moments.second_moment) < 0.1 * np.outer(deviations, deviations))
-
-
-def test_the_ratio_of_chord_and_arc_is_that_of_sinc():
-    for largest in (0.0, 1e-9, 0.5, 0.51, 7.0):
-        turns = np.linspace(-largest, largest, 101)
-        np.testing.assert_allclose(_chord(turns), np.sinc(turns / math.tau), rtol=0.0, atol=5e-11)
 
 
 def test_exponential_coordinates_are_those_of_log():
