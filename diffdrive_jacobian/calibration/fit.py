@@ -175,7 +175,7 @@ class Equations:
             return np.concatenate([border, gradient[:, :, None]], axis=2)
 
         diagonal, right = total('diagonal'), right_side()
-        # The reading errors, with a prior of unit weight, act on the reference only. They are eliminated.
+        # Reading errors, with a prior of unit weight, act on the reference only. They are eliminated.
         at = np.flatnonzero(self.reading.any(axis=(1, 2)))
         B, H, b = self.reading[at], total('diagonal', (1, 2))[at], right_side((1, 2))[at]
         back = np.swapaxes(B, 1, 2)
