@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -160,14 +161,14 @@ class SweepSetup(Checked):
         return Arrival(
             xy_tolerance=self.tolerance,
             use_heading=controller.takes_heading,
-            offset=self._number(controller.offset) if controller.offset else 0.0,
+            offset=controller.driven_offset(SimpleNamespace(**self._numbers)),
         )
 
-    def _number(self, name: str) -> float:
-        """Return the value of a gain that is not swept."""
-        (gain,) = (one for one in self.resolved_controller.gains if one.name == name)
-        value = self.gains.get(name, gain.default)
-        return gain.default if isinstance(value, tuple) else value
+    @property
+    def _numbers(self) -> dict[str, float]:
+        """By name, the value of each gain, the default of one that is swept."""
+        given = {name: value for name, value in self.gains.items() if not isinstance(value, tuple)}
+        return {gain.name: given.get(gain.name, gain.default) for gain in self.resolved_controller.gains}
 
     def poses(self) -> Array:
         """Return the start poses, shape (starts, 3), evenly spaced around the goal at the origin.
@@ -274,13 +275,10 @@ def _drive(setup: SweepSetup, rows: slice, progress: Callable[[int], object] | N
     """Return the outcomes of some rows of the grid, shape (rows, n, starts)."""
     controller = setup.resolved_controller
     x, y = setup.axes
-    values: dict[str, Any] = {
-        x.name: setup.values(x)[np.newaxis, :, np.newaxis],
-        y.name: setup.values(y)[rows, np.newaxis, np.newaxis],
-    }
-    for name in controller.gain_names:
-        values.setdefault(name, setup._number(name))
-    gains = [values[name] for name in controller.gain_names]
+    values: dict[str, Any] = setup._numbers
+    values[x.name] = setup.values(x)[np.newaxis, :, np.newaxis]
+    values[y.name] = setup.values(y)[rows, np.newaxis, np.newaxis]
+    gains = list(values.values())
     arrival = setup.arrival
     if controller.offset:
         arrival = replace(arrival, offset=values[controller.offset])
@@ -314,10 +312,9 @@ def _drive_on(
             f'controller {setup.resolved_controller.name!r} cannot be sent to another process; give the '
             f'name of an installed one, or functions at the top level of a module: {error}'
         ) from error
-    row_loops = setup.grid * setup.starts
-    step = max(1, LOOPS_PER_TASK // row_loops)
-    slices = [slice(begin, begin + step) for begin in range(0, setup.grid, step)]
-    futures = [executor.submit(_drive, setup, rows) for rows in slices]
+    step = max(1, LOOPS_PER_TASK // (setup.grid * setup.starts))
+    begins = range(0, setup.grid, step)
+    futures = [executor.submit(_drive, setup, slice(begin, begin + step)) for begin in begins]
     parts: list[Outcomes] = []
     try:
         for future in futures:

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controller import PathController
 from diffdrive_jacobian.control.controllers import find_controller
@@ -121,7 +121,13 @@ def track_line(
 
     On a mobile base a tip that is far from the axle needs a higher rate, because the wheels swing it.
     """
-    _check_callables(robot, secondary)
+    for method in ('forward_kinematics', 'jacobian', 'integrate'):
+        if not callable(getattr(robot, method, None)):
+            raise ValueError(f'robot must have the method {method}, got {short(robot, repr)}')
+    if secondary is not None and not callable(secondary):
+        raise ValueError(
+            f'secondary must be a function of the configuration, got {short(secondary, repr)}'
+        )
     if not isinstance(line, StraightLine):
         raise ValueError(f'line must be a control.StraightLine, got {short(line, repr)}')
     rate = number('rate', rate, positive)
@@ -186,16 +192,6 @@ def _error(x_desired: Array, x: Array) -> Array:
     return x_desired - x if x.shape[-1] == 2 else pose_difference(x_desired, x)
 
 
-def _check_callables(robot: Manipulator, secondary: object) -> None:
-    for method in ('forward_kinematics', 'jacobian', 'integrate'):
-        if not callable(getattr(robot, method, None)):
-            raise ValueError(f'robot must have the method {method}, got {short(robot, repr)}')
-    if secondary is not None and not callable(secondary):
-        raise ValueError(
-            f'secondary must be a function of the configuration, got {short(secondary, repr)}'
-        )
-
-
 def _inputs(
     robot: Manipulator, secondary: Callable[[Array], ArrayLike], q: Array, inputs: int, W_half: Array
 ) -> Array:
@@ -213,9 +209,6 @@ def _inputs(
     return np.asarray(uphill[..., 0, :] / W_half**2)
 
 
-Floats = NDArray[np.float64]
-
-
 class PathTracking(NamedTuple):
     """All k samples of a robot that follows a path.
 
@@ -228,11 +221,11 @@ class PathTracking(NamedTuple):
         finished: Whether the end of the path was reached in time.
     """
 
-    times: Floats
-    poses: Floats
-    references: Floats
-    twists: Floats
-    errors: Floats
+    times: Array
+    poses: Array
+    references: Array
+    twists: Array
+    errors: Array
     finished: bool
 
 
@@ -267,7 +260,13 @@ def follow_path(
     """
     instance('controller', controller, PathController)
     instance('path', path, Path)
-    values = _values(controller, gains or {})
+    gains = gains or {}
+    if unknown := sorted(set(gains) - set(controller.gain_names)):
+        names = ', '.join(controller.gain_names)
+        raise ValueError(f'gains must be among {names}, got {short(unknown[0])}')
+    values = SimpleNamespace(**{**vars(controller.defaults), **gains})
+    for gain in controller.gains:
+        gain.check(getattr(values, gain.name))
     if settings is None:
         settings = PathSettings(lookahead=controller.lookahead_distance(values))
     period = round(NANOSECONDS / number('rate', rate, positive))
@@ -293,13 +292,3 @@ def follow_path(
     times, poses, references, twists = (np.array(one) for one in zip(*samples, strict=True))
     errors = np.stack(path.errors(poses, references), axis=-1)
     return PathTracking(times, poses, references, twists, errors, command is None)
-
-
-def _values(controller: PathController, given: Mapping[str, float]) -> SimpleNamespace:
-    """Return the gains of a law, with those that are given."""
-    if unknown := sorted(set(given) - set(controller.gain_names)):
-        names = ', '.join(controller.gain_names)
-        raise ValueError(f'gains must be among {names}, got {short(unknown[0])}')
-    for gain in controller.gains:
-        gain.check(given.get(gain.name, gain.default))
-    return SimpleNamespace(**{**vars(controller.defaults), **given})
