@@ -131,18 +131,6 @@ def test_a_lagging_robot_reaches_the_command_and_is_then_an_ordinary_one():
         robot.at(SECOND).at(SECOND - 1)
 
 
-@pytest.mark.parametrize('stopped', [False, True])
-def test_a_lagging_robot_gets_as_far_as_without_the_lag(stopped):
-    """Whether it is stopped by its timeout or by a command at that time."""
-    robot = lagging(0.1, command_timeout=SECOND // 2).commanded((0.2, 0.0), 0)
-    assert robot.expiry == SECOND // 2
-    if stopped:
-        robot = robot.commanded((0.0, 0.0), SECOND // 2)
-    end = robot.at(10 * SECOND)
-    assert (end.twist, end.expiry) == ((0.0, 0.0), None)
-    assert math.dist(end.pose_tuple[:2], START[:2]) == pytest.approx(0.2 * 0.5, rel=1e-12)
-
-
 def test_a_motor_that_dies_while_it_lags_runs_out():
     tau = 0.1
     moving = lagging(tau).commanded((0.2, 0.0), 0).at(5 * SECOND)
@@ -199,16 +187,6 @@ def test_odometry_of_coarse_encoders_stays_within_their_increment_of_the_truth()
     assert worst > R * increment / 2.0
 
 
-def test_fine_encoders_give_the_exact_odometry():
-    robot = at_rest().commanded((0.2, 0.7), 0)
-    encoders = Encoders.at(robot, 10**9)
-    for tick in range(1, 51):
-        encoders = encoders.read(robot.at(tick * SECOND // 50))
-    end = robot.at(SECOND)
-    close(encoders.pose, end.pose, 1e-8)
-    assert encoders.reported(end).twist == pytest.approx((0.2, 0.7), abs=1e-6)
-
-
 def test_a_slow_wheel_is_seen_as_bursts_of_whole_increments():
     robot = at_rest().commanded((R * 1.0, 0.0), 0)
     encoders = Encoders.at(robot, 10)
@@ -229,8 +207,8 @@ def test_a_slow_wheel_is_seen_as_bursts_of_whole_increments():
 
 @pytest.mark.parametrize('noticed', [False, True])
 def test_a_push_is_a_motion_in_the_body_frame(noticed):
-    robot = replace_pose(at_rest(drift=Drift(left_wheel_radius_multiplier=1.2)))
-    robot = robot.commanded((0.2, 0.4), 0)
+    robot = at_rest(drift=Drift(left_wheel_radius_multiplier=1.2))
+    robot = robot.placed(START, np.diag([1e-4, 2e-4, 3e-4]), 0).commanded((0.2, 0.4), 0)
     before = robot.at(SECOND)
     after = robot.pushed((0.1, -0.05, 0.7), SECOND, noticed=noticed)
     close(compose(inverse(before.true_pose), after.true_pose), (0.1, -0.05, 0.7))
@@ -246,10 +224,6 @@ def test_a_push_is_a_motion_in_the_body_frame(noticed):
         after.at(2 * SECOND).true_pose,
         compose(after.true_pose, compose(inverse(before.true_pose), before.at(2 * SECOND).true_pose)),
     )
-
-
-def replace_pose(robot):
-    return robot.placed(START, np.diag([1e-4, 2e-4, 3e-4]), 0)
 
 
 def test_a_push_that_the_odometry_does_not_notice_needs_a_truth():

@@ -23,7 +23,7 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.testing import Lockstep
 
-SCHEDULES = 6
+SCHEDULES = 4
 TOPICS = {
     'odom': Odometry,
     'cmd_vel': Twist,

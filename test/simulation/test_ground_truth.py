@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
-from support.lockstep_nodes import QUICK, SECOND, Topics, arrives, change, make, make_complete
+from support.lockstep_nodes import SECOND, Topics, change, make, make_complete
 from support.recorded import recorded
-from support.ros_messages import goal, instants, placement, pose_of, twist, twist_stamped
+from support.ros_messages import instants, placement, pose_of, twist, twist_stamped
 
 from diffdrive_jacobian.bags.verification import COVARIANCE_TOLERANCE, verify
-from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
@@ -150,30 +149,6 @@ def test_the_same_stamped_commands_give_the_same_truth_at_each_publish_rate():
     assert of_other_seed[common[-1]].pose != truth[common[-1]].pose
 
 
-# --- Drives
-
-
-def driven_to_a_goal(**parameters):
-    """Drive to a goal in a world of its own; give the poses of the odometry and the truth at the end."""
-    with Lockstep() as world:
-        topics = Topics(world)
-        robot = world.add(make(VirtualRobot, **parameters))
-        world.add(make(GoToGoal, **QUICK))
-        world.publish('goal_pose', goal(1.0, 0.5))
-        arrives(world, topics)
-        return [one.pose.pose for one in topics.odom], pose_of(topics.odom[-1]), robot.truth
-
-
-def test_a_goal_driven_on_drifting_odometry_ends_where_the_truth_says():
-    poses, odometry, truth = driven_to_a_goal(**SLIPPING, true_right_wheel_radius_multiplier=1.02)
-    assert math.dist(odometry[:2], (1.0, 0.5)) < 0.02
-    assert math.dist(truth[:2], (1.0, 0.5)) > 0.03
-    # Neither the odometry nor the controller knows of it.
-    of_perfect, odometry, truth = driven_to_a_goal()
-    assert of_perfect == poses
-    np.testing.assert_allclose(truth, odometry, atol=1e-15)
-
-
 def test_initialpose_places_the_robot_and_reset_odometry_its_odometry_alone(lockstep, robot_at):
     topics, truths = Topics(lockstep), lockstep.listen(Odometry, 'ground_truth')
     robot = robot_at(1.0, 0.0, 0.0, **SLIPPING)
@@ -216,8 +191,8 @@ def test_invalid_parameters_are_named(parameters, named):
         from_ros(VirtualRobotParameters, parameters)
 
 
-def test_the_largest_seed_and_a_frame_map_of_a_perfect_robot_are_valid(lockstep, robot_at):
-    robot_at(odom_frame_id='map', slip_seed=2**63 - 1)
+def test_the_largest_seed_and_a_frame_map_of_a_perfect_robot_are_valid():
+    from_ros(VirtualRobotParameters, {'odom_frame_id': 'map', 'slip_seed': 2**63 - 1})
 
 
 def test_slip_cannot_change_while_the_robot_drives(lockstep, robot_at):

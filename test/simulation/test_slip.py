@@ -113,11 +113,6 @@ def test_the_truth_does_not_depend_on_when_it_is_computed(drift):
     assert expected.true_pose_tuple != expected.pose_tuple
 
 
-def test_seeds_differ_and_a_seed_repeats():
-    poses = [driven(robot(seed=seed), [((0.2, 0.1), 7)], SECOND).true_pose_tuple for seed in (1, 2, 1)]
-    assert poses[0] == poses[2] != poses[1]
-
-
 def test_odometry_is_that_of_a_perfect_robot():
     commands = irregular(4, 40)
     end = commands[-1][1] + SECOND
