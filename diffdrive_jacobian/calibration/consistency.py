@@ -22,7 +22,7 @@ from diffdrive_jacobian.calibration.model import (
     Array,
     Estimate,
     Segment,
-    prior_deviations,
+    prior_information,
 )
 from diffdrive_jacobian.calibration.motion import Geometry
 from diffdrive_jacobian.calibration.preparation import poses_apart
@@ -168,7 +168,7 @@ def _local(
     columns = [count + 3 * one for one in cells]
     information, gradient = score(segments, nominal, estimate, columns, count + 3 * number)
     free = np.flatnonzero(estimate.free)
-    known = information[np.ix_(free, free)] + np.diag(prior_deviations(count)[free] ** -2.0)
+    known = information[np.ix_(free, free)] + prior_information(estimate.free)
     cross = information[free, count:]
     gain = np.linalg.solve(known, np.column_stack([cross, gradient[free]]))
     moves = np.zeros((count, number, 3))

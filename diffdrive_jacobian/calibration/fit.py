@@ -27,6 +27,7 @@ from diffdrive_jacobian.calibration.model import (
     Noise,
     Segment,
     prior_deviations,
+    prior_information,
 )
 from diffdrive_jacobian.calibration.motion import (
     Geometry,
@@ -188,7 +189,7 @@ class Equations:
         eliminated += np.tensordot(b[:, :, :-1], G @ b, ((0, 1), (0, 1)))
         information = total('corner')[np.ix_(free, free)] - eliminated[:, :-1]
         information = (information + information.T) / 2.0
-        damped = information + np.diag(prior_deviations(len(free))[free] ** -2.0)
+        damped = information + prior_information(free)
         change = -np.linalg.solve(
             damped, total('gradient_corner')[free] + self.pull[free] - eliminated[:, -1]
         )
@@ -415,7 +416,7 @@ def score(
     free, pull = np.ones(count, dtype=bool), np.zeros(count)
     equations = linearized(segments, nominal, estimate, free, pull, columns=columns)
     found = equations.solved(_weights(estimate.noise))
-    damped = found.information + np.diag(prior_deviations(count) ** -2.0)
+    damped = found.information + prior_information(free)
     return found.information, -damped @ found.change
 
 
@@ -483,13 +484,13 @@ def _averaged(equations: Equations, noise: Noise) -> Array:
     h = 0.3
     curvature = (slope(-h) - slope(h)) / (2.0 * h) / 2.0
     width = min(WIDEST, max(curvature, 1e-9) ** -0.5)
-    scales = prior_deviations(len(equations.free))[equations.free] ** -2.0
+    prior = prior_information(equations.free)
     found = [at(sign * 3.0**0.5 * width)[0] for sign in (-1.0, 0.0, 1.0)]
     shares = np.array([1.0, 4.0, 1.0]) / 6.0
     changes = np.array([one.change for one in found])
     off = changes - shares @ changes
     covariance = sum(
-        share * (np.linalg.inv(one.information + np.diag(scales)) + np.outer(change, change))
+        share * (np.linalg.inv(one.information + prior) + np.outer(change, change))
         for share, one, change in zip(shares, found, off, strict=True)
     )
-    return np.asarray(np.linalg.inv(covariance) - np.diag(scales))
+    return np.asarray(np.linalg.inv(covariance) - prior)

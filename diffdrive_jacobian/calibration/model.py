@@ -124,8 +124,7 @@ class Estimate:
         Directions that the data do not determine have about the variance of `SCALES`.
         """
         full = np.zeros((len(self.parameters),) * 2)
-        scales = prior_deviations(len(self.parameters))[self.free]
-        inverse = np.linalg.inv(self.information + np.diag(scales**-2.0))
+        inverse = np.linalg.inv(self.information + prior_information(self.free))
         full[np.ix_(self.free, self.free)] = (inverse + inverse.T) / 2.0
         return full
 
@@ -133,14 +132,17 @@ class Estimate:
         """Return the estimate with additional errors, shape (any, number of parameters)."""
         free = np.ix_(self.free, self.free)
         covariance = self.covariance()[free] + (errors.T @ errors)[free]
-        scales = prior_deviations(len(self.parameters))[self.free]
-        information = np.linalg.inv(covariance) - np.diag(scales**-2.0)
-        return replace(self, information=np.asarray(information, dtype=np.float64))
+        return replace(self, information=np.linalg.inv(covariance) - prior_information(self.free))
 
 
 def prior_deviations(count: int) -> Array:
     """Return `SCALES` for a number of parameters."""
     return np.array([*SCALES[:TIME_OFFSETS], *[SCALES[-1]] * (count - TIME_OFFSETS)])
+
+
+def prior_information(free: NDArray[np.bool_]) -> Array:
+    """Return the information of the prior of the parameters that are free, out of all."""
+    return np.diag(prior_deviations(len(free))[free] ** -2.0)
 
 
 UNDETERMINED = 0.02
@@ -172,26 +174,21 @@ def undetermined(covariance: Array) -> list[tuple[str, str]]:
     """
     variances, directions = np.linalg.eigh(covariance)
     space = directions[:, variances > UNDETERMINED**2]
-    dimension = space.shape[1]
+    dimension, all_of_them = space.shape[1], f'{_STRAIGHT}, and {_TURN}'
     if dimension == 3:
-        return [('any of the multipliers', f'{_STRAIGHT}, and {_TURN}')]
+        return [('any of the multipliers', all_of_them)]
     found: list[tuple[str, str]] = []
     spanned = np.zeros((3, 0))
-    for name, direction, remedy in COMBINATIONS:
+    others = [('', tuple(direction), all_of_them) for direction in space.T.tolist()]
+    for name, direction, remedy in (*COMBINATIONS, *others):
         unit = np.array(direction) / np.linalg.norm(direction)
         if np.linalg.norm(space.T @ unit) < _WITHIN or spanned.shape[1] == dimension:
             continue
         rest = unit - spanned @ (spanned.T @ unit)
         if np.linalg.norm(rest) > 0.5:
-            spanned = np.column_stack([spanned, rest / np.linalg.norm(rest)])
-            found.append((name, remedy))
-    if spanned.shape[1] < dimension:
-        for direction in space.T:
-            rest = direction - spanned @ (spanned.T @ direction)
-            if np.linalg.norm(rest) > 0.5:
-                weights = rest / np.linalg.norm(rest)
-                parts = zip(weights.tolist(), ('left radius', 'right radius', 'separation'), strict=True)
-                text = ', '.join(f'{weight:+.2f} {name}' for weight, name in parts)
-                found.append((f'the combination {text}', f'{_STRAIGHT}, and {_TURN}'))
-                spanned = np.column_stack([spanned, weights])
+            rest /= np.linalg.norm(rest)
+            spanned = np.column_stack([spanned, rest])
+            left, right, separation = rest.tolist()
+            parts = f'{left:+.2f} left radius, {right:+.2f} right radius, {separation:+.2f} separation'
+            found.append((name or f'the combination {parts}', remedy))
     return found

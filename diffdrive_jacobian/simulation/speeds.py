@@ -158,7 +158,7 @@ class Piece(NamedTuple):
             size = max(size, t / self.tau)
         return next(quadrature for most, quadrature in _QUADRATURES if size <= most)
 
-    def displacement(self, t: float) -> tuple[float, float, float]:
+    def displacement(self, t: float) -> Pose:
         """Compute `(dx, dy, dtheta)` in the body frame of the beginning, after at most a step."""
         x = y = 0.0
         for node, weight in self.quadrature(t).nodes:
@@ -231,7 +231,7 @@ class Profile:
             begin = limit
 
 
-def moved(pose: tuple[float, float, float], piece: Piece) -> tuple[float, float, float]:
+def moved(pose: Pose, piece: Piece) -> Pose:
     """Return the pose after a piece, in steps that are short enough for one quadrature."""
     begin, step = 0.0, piece.step
     for number in range(1, round(piece.seconds / step) + 1):
@@ -241,14 +241,12 @@ def moved(pose: tuple[float, float, float], piece: Piece) -> tuple[float, float,
     return pose
 
 
-def displaced(
-    pose: tuple[float, float, float], displacement: tuple[float, float, float]
-) -> tuple[float, float, float]:
+def displaced(pose: Pose, displacement: Pose) -> Pose:
     """Return the pose after a displacement in its body frame; ValueError if it overflows."""
     (x, y, theta), (dx, dy, turn) = pose, displacement
     c, s = cos(theta), sin(theta)
     x, y = x + c * dx - s * dy, y + s * dx + c * dy
-    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(turn)):
+    if not (isfinite(x) and isfinite(y) and isfinite(turn)):
         raise ValueError('pose, twist and dt must give a finite result, but it overflows')
     return x, y, wrap(theta + turn)
 
@@ -289,9 +287,7 @@ def rolled(course: Course, piece: Piece, seconds: float) -> float:
     return sum(abs(end - begin) for begin, end in pairwise(places))
 
 
-def arc_end(
-    x: float, y: float, theta: float, v: float, omega: float, dt: float
-) -> tuple[float, float, float]:
+def arc_end(x: float, y: float, theta: float, v: float, omega: float, dt: float) -> Pose:
     """Return `se2.integrate` of finite floats, for every message; ValueError if it overflows."""
     try:
         end_x, end_y, end_theta = integrate.formula((x, y, theta), (v, omega), dt)
