@@ -214,10 +214,10 @@ def test_the_timeout_expires_at_its_own_time(stamp, look_after):
 
 def test_a_new_command_restarts_the_timeout_and_standing_still_needs_none():
     robot = start().commanded((0.2, 0.0), 0).commanded((0.2, 0.0), 200_000_000)
-    assert robot.expiry == 450_000_000
+    assert (robot.commanded_at, robot.expiry) == (200_000_000, 450_000_000)
     assert robot.commanded((0.0, 0.0), 300_000_000).expiry is None
     assert start(HELD).commanded((0.2, 0.0), 0).expiry is None
-    assert start().expiry is None
+    assert (start().commanded_at, start().expiry) == (None, None)
 
 
 # --- Other models, other places
