@@ -1,17 +1,12 @@
 """The uncertainty of a robot's pose along its path, computed when it is first needed.
 
-The equations are those of `exact_moments`, along motions whose speeds change with v(t), omega(t) and the
-densities vv(t), vw(t), ww(t). With the heading `z = exp(i theta)` since the start, `m(t)` half the
-variance of the error psi of the heading, and `u = exp(i psi)`, the error gamma of the position, in the
-frame of the start, obeys
+Along motions whose speeds change, with the heading `z = exp(i theta)` since the start, `m(t)` half the
+variance of the error psi of the heading, and `u = exp(i psi)`, the error gamma of the position obeys
 
     d gamma = z ((v + i vw/2) u - v) dt + z u dB_v
 
-Its expectations are integrals over t, computed by Gauss-Legendre quadrature. E[gamma^2] and E[|gamma|^2]
-need E[gamma], E[gamma u] and E[gamma* u] at the nodes, which are integrals of the polynomial through the
-nodes. The motion is split where a wheel changes its direction, because there the densities have a kink.
-
-Source: doc/mathematics.md, "Acceleration, lag and delay".
+Its expectations are integrals over t, by Gauss-Legendre quadrature. The motion is split where a wheel
+changes its direction. Source: doc/mathematics.md, "Acceleration, lag and delay".
 """
 
 from __future__ import annotations

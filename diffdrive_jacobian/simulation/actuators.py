@@ -1,22 +1,9 @@
 """Wheels that do not follow commands at once: acceleration limits, saturated motors, lag and delay.
 
-A command passes, in this order: the delay; the limits of the acceleration, which the robot knows; the
-largest speed of each motor, which it does not know; and the lag.
-
-The names, signs and rules of the limits are those of diff_drive_controller: which one applies to a speed
-depends on its sign and on whether it grows. Unlike there, v and omega share one time law `s(t)`, which
-rises from 0 to 1 as fast as all limits allow, linearly with a knot where v or omega changes its sign:
-
-    u(t) = u_0 + (u_1 - u_0) s(t)
-
-So from rest, to rest and between twists of equal curvature the path is one circle, as without limits.
-
-The speed of a lagging wheel follows what is demanded of it with first order:
-
-    tau d omega / dt = omega_demanded - omega
-
-The lag is the same for both wheels, so v and omega follow by the same equation. What is demanded is
-piecewise linear in time. So each speed is `a + b t + c exp(-t / tau)` in each piece (`speeds`).
+A command passes, in this order: the delay; the limits of the acceleration, as diff_drive_controller has
+them, but with one time law s(t) for v and omega, `u(t) = u_0 + (u_1 - u_0) s(t)`; the largest speed of
+each motor, which the robot does not know; and the lag, `tau d omega / dt = omega_demanded - omega`, the
+same for both wheels. So each speed is `a + b t + c exp(-t / tau)` in each piece (`speeds`).
 
 Source: doc/mathematics.md, "Acceleration, lag and delay".
 """

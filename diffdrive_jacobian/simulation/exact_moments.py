@@ -1,22 +1,13 @@
-"""Exact moments of the error of odometry about the reported pose.
-
-Model: as in `odometry_noise`, the travel of each wheel has a variance that grows by `k |ds|`. Where the
-covariance there is of first order in the error of the heading, the moments here are exact: they are the
-expectations over all paths that the robot may have driven.
+"""Exact moments of the error of odometry about the reported pose, under the model of `odometry_noise`.
 
 State: let delta be the error of the heading, unwrapped, and e the error of the position in the world
 frame, both relative to the reported pose. `Moments` has their second moments, and the moments with
-`C = cos(delta) - 1` and `S = sin(delta)` from which later second moments follow. No coordinate of the
-pose enters, so nothing cancels far from the origin.
+`C = cos(delta) - 1` and `S = sin(delta)` from which later second moments follow.
 
-What the noise adds along one arc are `NoiseMoments`: the reported twist `[v, omega]` is disturbed by
-white noise with the spectral densities vv, vw, ww, the entries of W. After the time t let psi be the
-error of the heading, and `gamma = gamma_x + i gamma_y` that of the position in the frame of the reported
-pose. psi is Gaussian with variance `ww t`, gamma is not. Notation: `x = i omega t`, `m = ww t / 2`,
-`alpha = v t`, `nu = vv t`, `beta = vw t`, `h = exp(i psi)`. The moments obey a linear differential
-equation with constant coefficients. Its solution is a power series in time, which converges fast for
-short arcs. Longer ones are halved and composed again. For the arcs between two messages the first terms
-of the series are written out.
+`NoiseMoments` are what one arc of the duration t adds: psi to the heading and gamma to the position, in
+the frame of the reported pose. Notation: `x = i omega t`, `m = ww t / 2`, `alpha = v t`, `nu = vv t`,
+`beta = vw t`, `h = exp(i psi)`, with the entries vv, vw, ww of W. They are a power series in time, and
+longer arcs are halved. For the arcs between two messages the first terms are written out.
 
 Source: doc/mathematics.md, "Odometry covariance".
 """

@@ -1,25 +1,14 @@
 """The true motion of a robot whose wheels slip, and whose wheels are not as its odometry assumes.
 
-Model: the wheels turn as commanded, and the odometry is computed from the radii and the separation that
-the robot assumes. The true ones may differ. In addition each wheel slips: the distance
-that it travels over the ground has a random error whose variance is `k |ds|`, as `odometry_noise` has
-it, where `ds` is the distance that its true rim rolls.
-
-Simulated time is divided into cells of `CELL`, at its multiples. For each wheel and each cell there is
-one standard normal number xi, a pure function of seed, wheel and cell: Philox4x64-10 with the key
-`(seed, wheel)` (right 0, left 1) and the cell as counter, and Box and Muller's transform. From a command
-to the next one, or to the end of the cell, the wheel slips at the constant speed
+Model: the distance that a true rim rolls has a random error whose variance is `k |ds|`. Time is divided
+into cells of `CELL`. For each wheel and cell there is one standard normal number xi, a pure function of
+seed, wheel and cell. From a command to the next one, or to the end of the cell, the wheel slips at
 
     xi (sqrt(V + k |v| t) - a) / t
 
-with v its rim speed, t the time that is left of the cell, V the variance `k |ds|` of the distance rolled
-so far in it, and `xi a` what has been slipped so far in it. So the variance in the whole cell is
-`k |ds|`, whatever the commands. In a cell under one command the speed is `xi sqrt(k |v| / CELL)`, and
-the true motion one exact arc. A wheel that stops goes on slipping until the cell ends.
-
-The state at a time follows from the last command through the cells between. It does not depend, to the
-last bit, on when it is computed. Under a command that is held for longer than `HOLD`, the width of cells
-doubles, and again with each doubling of the time held. So a long time takes few steps.
+with v its rim speed, t the time that is left of the cell, V the variance of the distance rolled so far
+in it, and `xi a` what has been slipped. So the state at a time does not depend, to the last bit, on when
+it is computed. Cells of a command that is held for longer than `HOLD` become wider.
 
 Sources: doc/mathematics.md, "Slip"; Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as
 1, 2, 3", 2011.

@@ -1,16 +1,8 @@
-"""Speeds that change with time, polynomials and exponential functions of it.
-
-Both v and omega of a body twist are piecewise
-
-    a + b t + c exp(-t / tau)
+"""Speeds that change with time: v and omega are piecewise `a + b t + c exp(-t / tau)`.
 
 That is what acceleration limits and a first-order lag of the wheels make of commands. The last piece is
-constant and has no end.
-
-The pose after a time is an integral over v and the heading. It is computed by Gauss-Legendre quadrature
-in steps that turn by at most `MAX_TURN` and last at most `MAX_DECAY` time constants, with fewer nodes in
-short ones. The steps of a piece are equal, and begin with it. So the state at a time depends on the
-pieces alone, not on the times at which states are computed.
+constant and has no end. The pose is computed by Gauss-Legendre quadrature in equal steps of each piece,
+so that it depends on the pieces alone, not on the times at which it is computed.
 """
 
 from __future__ import annotations

@@ -16,8 +16,7 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import BatteryState, Image, JointState, LaserScan
 from std_msgs.msg import Bool, Byte, Empty, Int8, Int64, String, UInt8
-from support.lockstep_nodes import QUICK, Topics, add_team, arrives
-from support.ros_messages import goal, odometry, time_of
+from support.ros_messages import odometry, time_of
 
 from diffdrive_jacobian.faults.topics import Corrupt
 
@@ -277,23 +276,6 @@ def test_a_receiver_gets_the_wrong_value_and_the_others_the_right_one(lockstep, 
     events = [event.what for event in lockstep.fault_events]
     assert any('changed' in event and '/odom to /receiver' in event for event in events)
     assert "Corrupt('odom', 'header.frame_id', 'set', amount='map', start=0.15)" in lockstep.report()
-
-
-def test_our_controller_drops_odometry_that_is_not_finite_and_goes_on_afterwards(lockstep):
-    x = 'pose.pose.position.x'
-    lockstep.inject(
-        *(Corrupt('odom', x, change, start=0.2, duration=0.2) for change in ('nan', 'negate'))
-    )
-    topics = Topics(lockstep)
-    add_team(lockstep, **QUICK)
-    lockstep.publish('goal_pose', goal(0.3, 0.1))
-    lockstep.run_for(0.2)
-    before = len(topics.commands)
-    lockstep.run_for(0.18)
-    assert len(topics.commands) == before
-    arrives(lockstep, topics)
-    numbers = [(one.linear.x, one.angular.z) for one in topics.commands]
-    assert np.isfinite(numbers).all()
 
 
 def test_a_field_that_does_not_exist_is_reported_when_the_type_is_known(lockstep, robot_at):

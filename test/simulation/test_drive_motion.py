@@ -154,20 +154,6 @@ def test_a_speed_that_changes_by_its_rounding_takes_no_time():
         assert turned.pose[2] == pytest.approx(1.0 - 0.1 * (1.0 - math.exp(-10.0)), abs=2e-8)
 
 
-def test_from_rest_to_a_speed_and_back_in_closed_form():
-    robot = at_rest(acceleration=limits()).commanded((0.4, 0.0), 0)
-    assert robot.at(SECOND // 2).twist == (0.25, 0.0)
-    close(robot.at(SECOND // 2).pose, (0.5 * 0.5**2 / 2, 0.0, 0.0))
-    there = robot.at(2 * SECOND)
-    assert there.twist == (0.4, 0.0)
-    close(there.pose, (0.4 * 2.0 - 0.4**2 / 2 / 0.5, 0.0, 0.0))
-    stopped = there.commanded((0.0, 0.0), 2 * SECOND)
-    rest = stopped.at(stopped.settles_at)
-    assert rest.twist == (0.0, 0.0)
-    close(rest.pose[0] - there.pose[0], 0.4**2 / 2 / 0.8)
-    assert rest.wheel_angles[0] == pytest.approx(rest.pose[0] / 0.033, rel=1e-12)
-
-
 def test_from_rest_and_to_rest_the_path_is_one_circle():
     radius = 0.4 / 1.5
     robot = at_rest(acceleration=limits()).commanded((0.4, 1.5), 0)
@@ -329,29 +315,6 @@ def test_a_weak_motor_clips_what_the_limits_demand():
         right, left = robot.at(stamp).wheel_speeds
         assert left == pytest.approx(min(0.5 * stamp / SECOND, 0.4) / 0.033)
         assert right == pytest.approx(min(4.0, left))
-
-
-@pytest.mark.parametrize(('axis', 'of'), [(0, V), (1, OMEGA)], ids=['v', 'omega'])
-def test_one_speed_is_that_of_diff_drive_controller_at_the_ends_of_its_cycles(axis, of):
-    """But where the sign changes: there it takes the limit of the old sign to the end of the cycle."""
-    rng, robot, cycle, command = np.random.default_rng(9), at_rest(acceleration=limits()), 0.02, 0.0
-    compared = {'rising': 0, 'crossing': 0}
-    for number in range(900):
-        stamp = number * SECOND // 50
-        if number % 30 == 0:
-            command = round(rng.uniform(-0.6, 0.6) * (axis + 1), 2)
-            robot = robot.commanded((command, 0.0) if axis == 0 else (0.0, command), stamp)
-        before, after = robot.at(stamp).twist[axis], robot.at(stamp + SECOND // 50).twist[axis]
-        most = axis_rate(of, before, command - before) * cycle
-        theirs = before + min(max(command - before, -most), most)
-        if before * after < 0.0:
-            compared['crossing'] += 1
-            assert abs(after - theirs) < 4.0 * cycle
-        else:
-            compared['rising'] += after != before
-            assert after == pytest.approx(theirs, abs=1e-12)
-    assert compared['rising'] > 240
-    assert compared['crossing'] > 3
 
 
 def test_limits_with_the_wrong_sign_are_refused():
