@@ -1,12 +1,8 @@
-"""The offset between the clocks of the wheels and of the reference, from the motion that both show.
+"""The offset between the clocks of the wheels and of the reference, from the speeds that both show.
 
-Forward speed and yaw rate of both are compared at every offset at which they overlap for at least half
-of the shorter one, and at those near zero. With the correlations rho of the N speeds in the overlap, the
-log-likelihood ratio against independent speeds is `N g`, `g = -1/2 sum(log(1 - rho^2))`. The offset has
-the largest g.
-
-A motion that repeats itself, such as equal laps, agrees as well at others. Then the offset nearest to
-zero must also be that at which both recordings cover the same time. If it is not, they are ambiguous.
+With the correlations rho of the N speeds in the overlap, the log-likelihood ratio against independent
+speeds is `N g`, `g = -1/2 sum(log(1 - rho^2))`. The offset has the largest g. A motion that repeats
+itself agrees as well at others. Then the offset nearest to zero must also have the largest overlap.
 """
 
 from __future__ import annotations

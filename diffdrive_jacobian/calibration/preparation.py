@@ -1,11 +1,8 @@
 """From recordings to continuous motions: overlap in time, gaps, glitches and jumps of the reference.
 
-Angles of a wheel come from an encoder with finite steps, sampled at finite rate. A reading is constant
-while the wheel turns by one step. Only its changes show where the wheel is. In between, the wheel is
-taken to turn at the speed that they show. Where the reading is constant for longer, the wheel may be
-anywhere within the step: the angle is its middle, and the reading error that of a uniform distribution.
-So an angle is about its mean given all readings, and the error does not correlate with it. Differences
-of the readings themselves have errors that do, which would bias the estimate.
+The angle of a wheel is its mean given all readings of its encoder. Where the reading is constant for
+long, that is the middle of the step, with the reading error of a uniform distribution. So the error does
+not correlate with the angle, as that of the readings themselves would, which biases the estimate.
 """
 
 from __future__ import annotations

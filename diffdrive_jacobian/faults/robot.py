@@ -1,10 +1,8 @@
 """Faults of the robot itself: its motors, wheels, encoders, and where it stands.
 
-They change the model of a `VirtualRobot` while it runs. `cmd_vel_out` has the motion of the wheels that
-results. As in a real robot, the encoders see whatever the motors do, and nothing of what happens between
-wheel and ground: `odom` shows the former, and only `ground_truth` the latter.
-
-A fault applies to the robot that has the name, also to one that is created later or again.
+They change the model of a `VirtualRobot` while it runs, also of one that is created later or again.
+As in a real robot, `odom` shows what the motors do, and only `ground_truth` what happens between wheel and
+ground. `cmd_vel_out` has the motion of the wheels that results.
 """
 
 from __future__ import annotations

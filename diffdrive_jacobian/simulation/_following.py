@@ -1,10 +1,7 @@
 """Robots of a batch that take time to follow commands: `actuators` for many robots at once.
 
 From one sample to the next a robot follows at most two commands, because each has an effect after a
-delay. Towards each its speeds are `a + b t + c exp(-t / tau)` in at most four pieces. The displacement
-along a piece is computed by Gauss-Legendre quadrature, as in `speeds`.
-
-Twists are arrays of shape (2, n): v (m/s) and omega (rad/s) of n robots.
+delay. Twists are arrays of shape (2, n): v (m/s) and omega (rad/s) of n robots.
 """
 
 from __future__ import annotations

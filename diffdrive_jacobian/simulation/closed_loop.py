@@ -1,12 +1,8 @@
 """Closed loops in batches: thousands of unicycles under a control law, simulated together.
 
-Every robot is sampled at the control rate. At each sample it either has arrived, or its law returns a
-body twist `[v, omega]` (m/s, rad/s). The twist is saturated, freed of whole turns per sample
-(`control.sampling.without_whole_turns`) and applied along the exact arc until the next sample. This is
-the loop of go_to_goal and virtual_robot without delay. With `actuators` robots take time to follow, as
-`Robot` does.
-
-Starts, goals, gains, robots and limits broadcast with each other; the batch is their leading axes.
+The loop is that of go_to_goal and virtual_robot: at each sample of the control rate a robot has arrived,
+or its law returns a body twist `[v, omega]` (m/s, rad/s), which is saturated and applied until the next
+one. Starts, goals, gains, robots and limits broadcast; the batch is their leading axes.
 
 Source: doc/mathematics.md, "Motion" and "Control laws".
 """

@@ -1,10 +1,7 @@
 """Incremental wheel encoders, and the odometry that follows from their counts.
 
-State: the counts of both wheels, and the pose of the odometry. Input: the wheel angles (rad). An encoder
-counts whole increments of `2 pi / per_revolution`. Between two readings the odometry follows one exact
-arc, with the distances of the counted increments. So it depends on how often the encoders are read.
-
-A wheel has turned by up to one increment more than was counted.
+An encoder counts whole increments of `2 pi / per_revolution`. Between two readings the odometry follows
+one exact arc, with the distances of the counted increments, so it depends on how often they are read.
 """
 
 from __future__ import annotations

@@ -1,13 +1,11 @@
 """Odometry covariance of first order: propagated with the Jacobians of the motion.
 
-The covariance of the pose is right while the standard deviation of the heading is small, and too small
-afterwards. It is here for comparison. The robot publishes the exact one of `exact_moments`.
-
-Model: the variance of the distance travelled by each wheel grows by `k |ds|` (m^2; k in m),
-independently of the other wheel. The covariance is the integral along the exact arc, not a sum over
-steps, so it does not depend on the rate at which it is computed:
+Model: the variance of the distance travelled by each wheel grows by `k |ds|` (m^2; k in m), for
+each independently. The covariance of the pose is the integral along the exact arc:
 
     P(T) = Phi P(0) Phi^T + integral_0^T g(s) W g(s)^T ds,  g(s) = Phi(T, s) S(theta_s)
+
+It is right while the standard deviation of the heading is small, see `exact_moments`.
 
 Source: doc/mathematics.md, "Odometry covariance"; the noise model is that of Siegwart, Nourbakhsh,
 Scaramuzza, *Introduction to Autonomous Mobile Robots*, 5.2.4.

@@ -1,17 +1,12 @@
 """The region that holds the position of a robot with a given probability, in exponential coordinates.
 
-After a long drive the positions that a robot may have form a banana, not an ellipse. In exponential
-coordinates `xi = log(pose^-1 q)` of SE(2) about the reported pose the distribution of the true pose q
-is nearer to a Gaussian, though after long straight drives it is clearly none. Its covariance is
-propagated to first order by Long et al., and to fourth order by Barfoot and Furgale. Driving straight
-for a minute, the first order is already too thin along the path. Here it is taken to all orders, from
-runs of the noise model along the reported path that are drawn at random with a fixed seed.
+It is the projection of the ellipsoid `xi^T covariance^-1 xi <= level` onto the plane, with
+`xi = log(pose^-1 q)` about the reported pose. Covariance and level are those of runs of the noise model
+along the reported path, drawn with a fixed seed, of which 95 % are within.
 
-The region of positions is the projection of the ellipsoid `xi^T covariance^-1 xi <= level` onto the
-plane. The level is that at which the region holds 95 % of the drawn runs: 5.99 for a Gaussian.
-
-Sources: Long, Wolfe, Mashner and Chirikjian, "The banana distribution is Gaussian", 2012; Barfoot and
-Furgale, "Associating uncertainty with three-dimensional poses for use in estimation problems", 2014.
+Sources: doc/mathematics.md, "Odometry covariance"; Long, Wolfe, Mashner and Chirikjian, "The banana
+distribution is Gaussian", 2012; Barfoot and Furgale, "Associating uncertainty with three-dimensional
+poses for use in estimation problems", 2014.
 """
 
 from __future__ import annotations

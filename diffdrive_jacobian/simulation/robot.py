@@ -6,11 +6,8 @@ timestamps. Times are integer nanoseconds, so that Unix time loses no precision.
 
 The state is stored at the last event (command, timeout, placement). Every later state is computed from
 it along one exact arc, or with `actuators` that take time along the `Drive` that began with that event.
-So the motion does not depend, to the last bit, on when states are computed. Covariances and arrays are
-computed when they are read: a node that needs none reads the tuples.
-
-The pose is that of the odometry, computed from the turns of the wheels. The robot is truly there, unless
-its model has a `drift`. `true_pose` is where it truly is.
+So the motion does not depend, to the last bit, on when states are computed. The pose is that of the
+odometry. With a `drift` in its model the robot is truly elsewhere, at `true_pose`.
 
 Source: doc/mathematics.md, "Motion".
 """
