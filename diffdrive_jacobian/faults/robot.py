@@ -1,8 +1,8 @@
 """Faults of the robot itself: its motors, wheels, encoders, and where it stands.
 
 They change the model of a `VirtualRobot` while it runs, also of one that is created later or again.
-As in a real robot, `odom` shows what the motors do, and only `ground_truth` what happens between wheel and
-ground. `cmd_vel_out` has the motion of the wheels that results.
+`odom` shows what the motors do, and only `ground_truth` what happens between wheel and ground.
+`cmd_vel_out` has the motion of the wheels that results.
 """
 
 from __future__ import annotations
