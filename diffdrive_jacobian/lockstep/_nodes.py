@@ -79,8 +79,9 @@ class Nodes:
     def restart(self, name: str) -> None:
         """Create the node of a name again."""
         node = self._factories[name]()
-        self.check_new(node)
-        self._scheduler.add(node)
+        if node not in self._scheduler.nodes:
+            self.check_new(node)
+            self._scheduler.add(node)
         if not self._scheduler.clocks.pauses:
             self._scheduler.clocks.set()
 

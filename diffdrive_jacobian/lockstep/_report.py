@@ -24,7 +24,7 @@ MAX_CHECKED = 100
 
 
 def describe(
-    sources: Values[tuple[Publisher | None, Source]],
+    sources: Values[tuple[Publisher, Source]],
     nodes: Values[Node],
     existing: Values[Node],
     now: int,
@@ -33,20 +33,19 @@ def describe(
     """Return the last message of each publisher, and the subscribed topics without messages, as text.
 
     Args:
-        sources: What was published, each with its publisher. None: by other processes.
+        sources: What was published, each with its publisher.
         nodes: The nodes of the world.
         existing: These, and those that were created but not added.
         now: Simulated time (ns).
         world_time: Time since the start (ns).
     """
-    names: dict[Publisher | None, str] = {
+    names = {
         publisher: node.get_fully_qualified_name() for node in existing for publisher in node.publishers
     }
-    names[None] = 'other processes'
     published = [
         (source.topic, names.get(publisher, 'a destroyed publisher'), source)
         for publisher, source in sources
-        if source.topic not in NOT_OF_ROBOTS or publisher is None
+        if source.topic not in NOT_OF_ROBOTS
     ]
     lines = [
         f'  {topic}: {source.count} from {node}, last at {source.at / NANOSECONDS:g} s: '
