@@ -149,9 +149,17 @@ class Lockstep:
         """Return this object."""
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Close it."""
-        self.close()
+    def __exit__(self, kind: object, *_: object) -> None:
+        """Close it.
+
+        Raises:
+            LockstepError: A process that was started has lost messages, and there is no other error.
+        """
+        try:
+            if kind is None and self.is_open:
+                self._check_processes(finally_=True)
+        finally:
+            self.close()
 
     @property
     def is_open(self) -> bool:
@@ -175,9 +183,9 @@ class Lockstep:
         for process in self._processes:
             process.close()
 
-    def _check_processes(self) -> None:
+    def _check_processes(self, *, finally_: bool = False) -> None:
         for process in self._processes:
-            process.check()
+            process.check(finally_=finally_)
 
     def _check_open(self) -> None:
         if Lockstep._open is not self:
@@ -482,6 +490,7 @@ class Lockstep:
         if self._properties:
             # Not otherwise: a test may have passed because a callback raises what it expects.
             self.settle()
+        self._check_processes(finally_=True)
         self._properties.finish()
         self.check_faults()
 

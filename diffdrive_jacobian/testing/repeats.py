@@ -7,23 +7,27 @@ from itertools import zip_longest
 from typing import Any
 
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 
 from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._report import brief
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 
 class _Messages(MessageDigest):
-    """Keeps the hash after each message."""
+    """Keeps each message as text, and the hash after it."""
 
     def __init__(self, world: Lockstep) -> None:
         super().__init__(world)
-        self.all: list[tuple[int, str, str]] = []
+        self.all: list[tuple[int, str, str, str]] = []
 
     def _add(self, publisher: Publisher, message: Any) -> None:
         super()._add(publisher, message)
-        self.all.append((self._world.now, publisher.topic_name, self.value()))
+        if isinstance(message, bytes):
+            message = deserialize_message(message, publisher.msg_type)
+        self.all.append((self._world.now, publisher.topic_name, brief(message), self.value()))
 
 
 def check_repeats(
@@ -42,7 +46,7 @@ def check_repeats(
     Raises:
         LockstepError: Two runs differ. The message names the first message that does.
     """
-    first: list[tuple[int, str, str]] | None = None
+    first: list[tuple[int, str, str, str]] | None = None
     for number in range(runs):
         with Lockstep(args) as world:
             messages = _Messages(world)
@@ -60,8 +64,8 @@ def check_repeats(
                 )
 
 
-def _text(message: tuple[int, str, str] | None) -> str:
+def _text(message: tuple[int, str, str, str] | None) -> str:
     if message is None:
         return 'none'
-    time, topic, digest = message
-    return f'{topic} at {time / NANOSECONDS:g} s (hash of all so far {digest[:8]})'
+    time, topic, text, digest = message
+    return f'{topic} at {time / NANOSECONDS:g} s: {text} (hash of all so far {digest[:8]})'

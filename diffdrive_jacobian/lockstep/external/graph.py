@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
@@ -20,6 +20,7 @@ OF_EVERY_PROCESS = ('/rosout', '/parameter_events')
 CLOCK_TYPE = 'rosgraph_msgs/msg/Clock'
 DESCRIPTIONS = 'type_description_interfaces/'
 """Package of the type of a service that every node has, and that only tools call."""
+Quality = tuple[ReliabilityPolicy, DurabilityPolicy]
 PID = slice(4, 6)
 """Bytes of a GID of Fast DDS with the lower half of the number of its process."""
 
@@ -66,14 +67,10 @@ def nodes_beside(node: Node) -> list[NodeGraph]:
     return found
 
 
-def profile_of(infos: Iterable[TopicEndpointInfo], node: str, depth: int) -> QoSProfile:
-    """Return a profile with the reliability and durability of the endpoint of a node.
-
-    Others than these run on wall time. The graph does not show the depth.
-    """
-    (info, *_) = [one for one in infos if node_of(one) == node]
-    qos = info.qos_profile
-    return QoSProfile(depth=depth, reliability=qos.reliability, durability=qos.durability)
+def qualities_of(infos: Iterable[TopicEndpointInfo], node: str) -> set[Quality]:
+    """Return the reliability and durability of the endpoints of a node. Others run on wall time."""
+    profiles = [info.qos_profile for info in infos if node_of(info) == node]
+    return {(profile.reliability, profile.durability) for profile in profiles}
 
 
 def reliable(profile: QoSProfile) -> QoSProfile:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -23,10 +23,11 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 
-from diffdrive_jacobian.lockstep._errors import LockstepError, described
+from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._gate import FREE
 from diffdrive_jacobian.lockstep._link import Link, Source, Stage
 from diffdrive_jacobian.lockstep._nodes import Nodes
@@ -34,6 +35,7 @@ from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
 from diffdrive_jacobian.lockstep.external import graph as graphs
 from diffdrive_jacobian.lockstep.external import relays
+from diffdrive_jacobian.lockstep.external.datagrams import LIMIT, QUEUE, Datagrams, sockets_of
 from diffdrive_jacobian.lockstep.external.process import CLOSING, ExternalProcess, free_domain
 from diffdrive_jacobian.lockstep.external.quiet import (
     Allowance,
@@ -44,6 +46,7 @@ from diffdrive_jacobian.lockstep.external.quiet import (
 from diffdrive_jacobian.lockstep.external.relays import CALL, INPUT, SERVICE, TOPIC, Arrived, Relay
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.names import node_of
+from diffdrive_jacobian.ros.fastdds_profiles import for_other_process
 from diffdrive_jacobian.ros.rclpy_internals import (
     graph_changed,
     raw_sender,
@@ -51,6 +54,7 @@ from diffdrive_jacobian.ros.rclpy_internals import (
     take_response,
 )
 from diffdrive_jacobian.ros.runner import DISCOVERY, environment, ros_context
+from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 PERIOD = 0.01
@@ -90,11 +94,19 @@ class Command:
 
     def __post_init__(self) -> None:
         """Check the command."""
-        if isinstance(self.command, (str, os.PathLike)) or not self.command:
-            raise LockstepError(
-                "start takes a program and its arguments, ['ros2', 'run', 'my_package', 'my_node'], got "
-                f'{described(self.command)}'
+        command = [] if isinstance(self.command, (str, bytes, os.PathLike)) else self.command
+        if not (isinstance(command, Sequence) and command and all(map(_is_text, command))):
+            raise _error(
+                "start takes a program and its arguments, ['ros2', 'run', 'my_package', 'my_node']",
+                self.command,
             )
+        if not (self.cwd is None or _is_text(self.cwd)):
+            raise _error('cwd must be a path', self.cwd)
+        if not isinstance(self.env, Mapping) or not all(map(_is_variable, self.env.items())):
+            raise _error("env must be names with texts, {'NAME': 'value'}", self.env)
+        depth = self.queue_depth
+        if isinstance(depth, bool) or not isinstance(depth, int) or not 0 < depth < relays.DEPTH:
+            raise _error(f'queue_depth must be an integer from 1 to {relays.DEPTH - 1}', depth)
         for name in ('clock_period', 'timeout', 'patience'):
             checked_nanoseconds(name, getattr(self, name))
 
@@ -104,9 +116,26 @@ class Command:
         hash_seed = {} if 'PYTHONHASHSEED' in os.environ else {'PYTHONHASHSEED': '0'}
         return ExternalProcess(
             [*(os.fspath(part) for part in self.command), *timed],
-            {**domain, **hash_seed, **self.env},
+            {**domain, **for_other_process(), **hash_seed, **self.env},
             None if self.cwd is None else os.fspath(self.cwd),
         )
+
+
+def _error(allowed: str, got: object) -> LockstepError:
+    return LockstepError(f'{allowed}, got {printable(repr(got), 200)}')
+
+
+def _is_text(value: Any) -> bool:
+    """Return whether a value is a text, or a path, that can be passed to a process."""
+    return isinstance(value, (str, os.PathLike)) and '\0' not in str(os.fspath(value))
+
+
+def _is_variable(item: tuple[Any, Any]) -> bool:
+    """Return whether a name and a value are those of an environment variable."""
+    name, value = item
+    if not (isinstance(name, str) and isinstance(value, str)):
+        return False
+    return bool(name) and '=' not in name and '\0' not in name + value
 
 
 class StandIn(Node):  # type: ignore[misc]
@@ -157,6 +186,8 @@ class NodeProcess:
         self._extend, self._is_open = extend, is_open
         self._clocks = scheduler.clocks
         self._ended: list[ExternalProcess] = []
+        self._names: set[str] = set()
+        """Of all nodes that it has had."""
         self._closing = ExitStack()
         self._reset()
         self._scheduler.links.filter(self._drop_echoes, first=True)
@@ -168,6 +199,7 @@ class NodeProcess:
         self._stand_ins: dict[str, StandIn] = {}
         self._relays: dict[tuple[int, str], Relay] = {}
         self._latched: list[Arrived] = []
+        self._qualities: dict[tuple[int, str], set[graphs.Quality]] = {}
         self._sent: dict[str, list[bytes]] = {}
         self._clock_publishers: dict[str, Publisher] = {}
         self._participants: set[int] = set()
@@ -217,11 +249,16 @@ class NodeProcess:
     def stop(self, timeout: float = CLOSING) -> int:
         """End it by SIGINT, and kill it if it does not end. Return the exit code.
 
-        What it publishes at its end is received by the others.
+        What it publishes at its end is received by the others. A fault does not start it again.
 
         Args:
             timeout: Longest time for its end (s).
         """
+        checked_nanoseconds('timeout', timeout)
+        self._forget()
+        return self._stop(timeout)
+
+    def _stop(self, timeout: float = CLOSING) -> int:
         code = self.child.stop(timeout)
         if self._connected:
             self._wait()
@@ -230,10 +267,19 @@ class NodeProcess:
         return code
 
     def kill(self) -> None:
-        """Kill it. Nothing that was sent to it is processed."""
+        """Kill it. Nothing that was sent to it is processed, and a fault does not start it again."""
+        self._forget()
+        self._kill()
+
+    def _kill(self) -> None:
         self._scheduler.killed.update(self._stand_ins.values())
         self.child.kill()
         self._leave()
+
+    def _forget(self) -> None:
+        """Do not let a fault start it again."""
+        for name in self._names:
+            self._nodes.forget(name)
 
     def describe(self) -> str:
         """Return its state, and the end of what it printed."""
@@ -267,7 +313,7 @@ class NodeProcess:
         """Start the process, and create what is needed to receive from it."""
         self._domain = free_domain()
         domain = {DISCOVERY[0]: 'LOCALHOST', 'ROS_DOMAIN_ID': str(self._domain)}
-        before = threads_of_this_process()
+        before, others = threads_of_this_process(), sockets_of(os.getpid())
         with environment({**dict.fromkeys(DISCOVERY), **domain}):
             context = self._closing.enter_context(ros_context(['lockstep']))
         self._outside = Node(
@@ -284,11 +330,14 @@ class NodeProcess:
         self._quiet = Quiet(self.child.root, receiving)
         self._closing.callback(self._quiet.close)
         self._listeners = self._quiet.listeners()
+        self._datagrams = Datagrams()
+        self._datagrams.watch(os.getpid(), but=others)
 
     def join(self) -> None:
         """Add the nodes to the world. They receive the time."""
         for name, node in self._stand_ins.items():
             self._nodes.created(node, partial(self._restart, name))
+            self._names.add(name)
             if node not in self._scheduler.nodes:
                 self._nodes.check_new(node)
                 self._nodes.add(node, observer=False)
@@ -308,7 +357,7 @@ class NodeProcess:
         stand_ins = self.start()
         found = next((one for one in stand_ins if one.get_fully_qualified_name() == name), None)
         if found is None:
-            raise LockstepError(f'{self.command} was started again, and has no node {name} now')
+            raise LockstepError(f'{self.child.title} was started again, and has no node {name} now')
         self.join()
         return found
 
@@ -317,9 +366,9 @@ class NodeProcess:
         if not self._is_open() or stand_in not in self._stand_ins.values():
             return
         if stand_in in self._scheduler.killed:
-            self.kill()
+            self._kill()
         else:
-            self.stop()
+            self._stop()
 
     def _leave(self) -> None:
         """Remove the nodes from the world."""
@@ -359,7 +408,7 @@ class NodeProcess:
                 subscribing = subscribing or Allowance(self._quiet, SUBSCRIBING)
                 if subscribing.is_used_up():
                     raise LockstepError(
-                        f'{", ".join(untimed)} of {self.command} is not subscribed to /clock: its '
+                        f'{", ".join(untimed)} of {self.child.title} is not subscribed to /clock: its '
                         'parameter use_sim_time must be true; if it needs no time: '
                         'start(..., use_sim_time=False)'
                     )
@@ -373,6 +422,8 @@ class NodeProcess:
         self._latched += [arrived for arrived in late if arrived.latched]
         self._refuse([arrived for arrived in late if not arrived.latched])
         self._quiet.learn()
+        for pid in self._participants:
+            self._datagrams.watch(pid)
 
     def _is_matched(self) -> bool:
         """Return whether the world has discovered all endpoints of the process."""
@@ -402,7 +453,8 @@ class NodeProcess:
     def _learn_topics(self, graph: graphs.NodeGraph, node: StandIn) -> None:
         outside, name = self._outside, graph.full_name
         for topic, kind in graph.publishers.items():
-            profile = graphs.profile_of(outside.get_publishers_info_by_topic(topic), name, relays.DEPTH)
+            infos = outside.get_publishers_info_by_topic(topic)
+            profile = self._profile(TOPIC, topic, graphs.qualities_of(infos, name), relays.DEPTH)
             sent = self._sent.setdefault(topic, [])
             self._relay(TOPIC, topic, kind, node, relays.from_topic, profile, sent)
         for topic, kind in graph.subscriptions.items():
@@ -411,9 +463,32 @@ class NodeProcess:
                     self._clock_publishers[topic] = outside.create_publisher(Clock, topic, 1)
                 continue
             depth = self._command.queue_depth
-            profile = graphs.profile_of(outside.get_subscriptions_info_by_topic(topic), name, depth)
+            infos = outside.get_subscriptions_info_by_topic(topic)
+            profile = self._profile(INPUT, topic, graphs.qualities_of(infos, name), depth)
             sent = self._sent.setdefault(topic, [])
-            self._relay(INPUT, topic, kind, node, relays.to_topic, profile, self._deliver, sent)
+            self._relay(
+                *(INPUT, topic, kind, node, relays.to_topic),
+                *(profile, self._deliver, sent, self._command.patience),
+            )
+
+    def _profile(
+        self, role: int, topic: str, qualities: Iterable[graphs.Quality], depth: int
+    ) -> QoSProfile:
+        """Return the profile of a topic, whose depth the graph does not show.
+
+        Raises:
+            LockstepError: There are several.
+        """
+        known = self._qualities.setdefault((role, topic), set())
+        known |= set(qualities)
+        ((reliability, durability), *others) = known
+        if others:
+            found = sorted(f'{one.name} and {other.name}' for one, other in known)
+            raise LockstepError(
+                f'{self.child.title} uses {topic} with several qualities of service, at once or one after '
+                f'the other: {", ".join(found)}; nodes in other processes may use one for each topic'
+            )
+        return QoSProfile(depth=depth, reliability=reliability, durability=durability)
 
     def _relay(
         self, role: int, name: str, kind: str, node: StandIn, create: Callable[..., Relay], *args: Any
@@ -456,13 +531,13 @@ class NodeProcess:
         if numbers and not pids:
             raise ForeignNodeError(
                 f'node {graph.full_name} is in domain {self._domain}, but in no process that '
-                f'{self.command} has started and that runs on: a container or another machine cannot '
-                'take part in lockstep'
+                f'{self.child.title} has started and that runs on: a container or another machine '
+                'cannot take part in lockstep'
             )
         self._participants |= pids
         if len(self._participants) > 1:
             raise LockstepError(
-                f'{self.command} has started several processes with nodes: '
+                f'{self.child.title} has started several processes with nodes: '
                 f'{", ".join(map(str, sorted(self._participants)))}; start each of them by itself, '
                 'because messages between them would not be received one at a time'
             )
@@ -491,7 +566,8 @@ class NodeProcess:
             self.child.check_running()
             if allowance.is_used_up():
                 raise LockstepError(
-                    f'{name} does not respond: the executor of the node does not spin; '
+                    f'{name} does not respond: the executor of the node does not spin, or waits for '
+                    'what comes later, as a service in its constructor; '
                     f'{self._quiet.describe()}\n{self.describe()}'
                 )
             overdue = response is None and time.monotonic() > begin + number * REPETITION
@@ -514,14 +590,16 @@ class NodeProcess:
         waited = f'within {self._command.timeout:g} s (timeout=)'
         missing = [name for (_, name), relay in self._relays.items() if not relay.is_matched()]
         if missing:
-            return f'{self.command}: not discovered {waited}: {", ".join(missing)}\n{self.describe()}'
+            return (
+                f'{self.child.title}: not discovered {waited}: {", ".join(missing)}\n{self.describe()}'
+            )
         hint = 'it has created none, or not yet'
         if others := _domains(self._quiet.processes()) - {self._domain}:
             hint = (
                 f'it is in ROS domain {", ".join(map(str, sorted(others)))} instead of {self._domain}: '
                 'it must not set ROS_DOMAIN_ID, which start() sets for it'
             )
-        return f'no node of {self.command} was discovered {waited}: {hint}\n{self.describe()}'
+        return f'no node of {self.child.title} was discovered {waited}: {hint}\n{self.describe()}'
 
     # --- Exchange
 
@@ -566,6 +644,7 @@ class NodeProcess:
         send()
         self._wait()
         arrived = self._take()
+        self._check_lost()
         for sent in self._sent.values():
             sent.clear()
         self._extend(time.monotonic() - begin)
@@ -596,10 +675,11 @@ class NodeProcess:
         try:
             self._quiet.wait(self._command.patience)
         except LockstepError as error:
-            names = ', '.join(self._stand_ins) or self.command
+            names = ', '.join(self._stand_ins) or self.child.title
             raise LockstepError(
-                f'{names} {error}\n  a loop that polls or sleeps on wall time cannot run in lockstep; '
-                'for a callback that takes longer: start(..., patience=)\n' + self.describe()
+                f'{names} {error}\n  a loop that polls or sleeps on wall time cannot run in lockstep, '
+                'also in a program that it has started; for a callback that takes longer: '
+                'start(..., patience=)\n' + self.describe()
             ) from None
 
     def _take(self) -> list[Arrived]:
@@ -611,11 +691,26 @@ class NodeProcess:
         for one in arrived:
             one.forward()
 
-    def check(self) -> None:
-        """Check that it runs, and has sent nothing while nothing was delivered to it."""
+    def check(self, *, finally_: bool = False) -> None:
+        """Check that it runs, has lost nothing, and has sent nothing while nothing was delivered to it.
+
+        Args:
+            finally_: Whether this is the last check.
+        """
         if self._connected:
             self.child.check_running(', '.join(self._stand_ins))
             self._refuse(self._take())
+            self._check_lost(now=finally_)
+
+    def _check_lost(self, *, now: bool = False) -> None:
+        """Raise LockstepError if messages between the world and the process are known to be lost."""
+        if self._datagrams.lost(now=now):
+            raise LockstepError(
+                f'messages to or from {", ".join(self._stand_ins)} were lost at '
+                f'{self._clocks.now / NANOSECONDS:g} s or before: more was sent at once than a socket can '
+                f'hold; {LIMIT} allows {Path(LIMIT).read_text().strip()} bytes, and may need '
+                f'{QUEUE}: sysctl -w net.core.rmem_max={QUEUE}'
+            )
 
     def _refuse(self, arrived: Sequence[Arrived]) -> None:
         """Raise LockstepError if something has arrived."""

@@ -19,6 +19,7 @@ from pathlib import Path
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.ros.fastdds_profiles import VARIABLE
 from diffdrive_jacobian.ros.runner import DISCOVERY
+from diffdrive_jacobian.text import printable
 
 DOMAINS = range(102, 232)
 """Domains to choose from. Others do not use them: Linux gives ports of most of them to clients, too."""
@@ -26,6 +27,8 @@ PARTICIPANTS = 32
 """Number of participants of a domain whose ports are looked at. Each process has one or more."""
 SHOWN_LINES = 15
 """Number of lines that an error quotes of what a process printed."""
+LINE = 500
+"""Most characters of a line that an error quotes."""
 CLOSING = 5.0
 """Time for a process to end after SIGINT (s). Then it is killed."""
 NAP = 0.005
@@ -98,6 +101,8 @@ class ExternalProcess:
         """
         self.command = shlex.join(command)
         """The command line."""
+        self.title = printable(self.command, LINE)
+        """The command line as errors name it."""
         self.ended_by_test = False
         """Whether the test has ended it."""
         self._files = [tempfile.TemporaryFile() for _ in range(2)]  # noqa: SIM115
@@ -118,7 +123,7 @@ class ExternalProcess:
                 start_new_session=True,
             )
         except OSError as error:
-            raise LockstepError(f'{self.command} cannot be started: {error}') from error
+            raise LockstepError(f'{self.title} cannot be started: {error}') from error
         self.root = self._process.pid
         """Id of the process from which all others descend."""
         self.pid = self.root
@@ -134,7 +139,10 @@ class ExternalProcess:
         """Raise LockstepError if it has ended by itself. `node` says what depends on it."""
         if self.returncode is not None and not self.ended_by_test:
             what = f'{node}: ' if node else ''
-            raise LockstepError(f'{what}{self.describe()}')
+            background = '\n  what runs in the background ends then: start it in the foreground'
+            raise LockstepError(
+                f'{what}{self.describe()}{"" if self.returncode or node else background}'
+            )
 
     @property
     def returncode(self) -> int | None:
@@ -193,17 +201,17 @@ class ExternalProcess:
         """Return its state, and the end of what it printed."""
         code = self.returncode
         if code is None:
-            state = f'{self.command} (pid {self.pid}) is running'
+            state = f'{self.title} (pid {self.pid}) is running'
         elif code < 0:
-            state = f'{self.command} was ended by {_signal_name(-code)}'
+            state = f'{self.title} was ended by {_signal_name(-code)}'
         elif code > 128 and (name := _signal_of_child(code)):
-            state = f'{self.command} has exited with {code}: what it started was ended by {name}'
+            state = f'{self.title} has exited with {code}: what it started was ended by {name}'
         else:
-            state = f'{self.command} has exited with {code}'
+            state = f'{self.title} has exited with {code}'
         lines = [state]
         for number, name in enumerate(('stdout', 'stderr')):
             if shown := self.printed(number).splitlines()[-SHOWN_LINES:]:
-                lines += [f'  {name}:', *(f'    {line}' for line in shown)]
+                lines += [f'  {name}:', *(f'    {printable(line, LINE)}' for line in shown)]
         return '\n'.join(lines)
 
 

@@ -3,9 +3,9 @@
 `Quiet` looks at a process with all that it has started, and at the threads of this process that receive
 from them. It reads for how long each has run, then in which system call each thread waits, then whether
 it sleeps, and then again for how long they have run. If all threads sleep and nothing has run
-meanwhile, then all of them slept when the first reading was complete, and no message was on its way from one to
-another. The system call does not tell: that of a thread that was woken up, and does not run yet because
-its processor has to be told, is the one in which it waited.
+meanwhile, then all of them slept when the first reading was complete, and no message was on its way
+from one to another. The system call does not tell: that of a thread that was woken up, and does not run
+yet because its processor has to be told, is the one in which it waited.
 
 A thread that sleeps for a time goes on by itself, so it counts as busy. So does one that waits with a
 timeout, which is in a callback, unless it is DDS that waits, as in an idle executor, or it is a thread

@@ -12,10 +12,12 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from rclpy.client import Client
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
+from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._link import is_latched
 from diffdrive_jacobian.lockstep.external.graph import reliable
 from diffdrive_jacobian.ros.rclpy_internals import (
@@ -31,6 +33,8 @@ DEPTH = 1000
 """Queue size in the domain of the process: the number of messages of a topic at one simulated time."""
 QUEUE = 10
 """Queue size of a client."""
+ONE_DATAGRAM = 60_000
+"""Size up to which a message is sent in one datagram (bytes)."""
 TOPIC, INPUT, SERVICE, CALL = range(4)
 """What a relay passes, of the process: what it publishes, receives, offers, and calls."""
 
@@ -86,7 +90,14 @@ def from_topic(
 
     def take() -> Iterator[Arrived]:
         latched = is_latched(subscription)
+        number = 0
         while (taken := take_next(kind, True)) is not None:
+            number += 1
+            if number == DEPTH:
+                raise LockstepError(
+                    f'more than {DEPTH - 1} messages were published on {topic} at once: lockstep does '
+                    'not receive more without loss'
+                )
             data = taken[0]
             if data in sent:
                 sent.remove(data)
@@ -104,6 +115,7 @@ def to_topic(
     profile: QoSProfile,
     deliver: Deliver,
     sent: list[bytes],
+    patience: float,
 ) -> Relay:
     """Return the relay of a topic to which a node of the process is subscribed.
 
@@ -115,6 +127,7 @@ def to_topic(
         profile: Quality of service that the process requests.
         deliver: Delivers a message.
         sent: Receives what is sent.
+        patience: Longest time until a message has arrived (s).
     """
     publisher = outside.create_publisher(kind, topic, reliable(profile))
     send_raw = raw_sender(publisher)
@@ -122,6 +135,9 @@ def to_topic(
     def send(data: bytes) -> None:
         sent.append(data)
         send_raw(data)
+        # Parts of a large message may be lost, and are sent again.
+        if len(data) > ONE_DATAGRAM and not publisher.wait_for_all_acked(Duration(seconds=patience)):
+            raise LockstepError(f'a message of {len(data)} bytes on {topic} was not received')
 
     def receive(data: bytes) -> None:
         deliver(partial(send, data))
