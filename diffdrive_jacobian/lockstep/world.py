@@ -157,7 +157,7 @@ class Lockstep:
         """
         try:
             if kind is None and self.is_open:
-                self._check_processes(finally_=True)
+                self._check_lost()
         finally:
             self.close()
 
@@ -183,9 +183,13 @@ class Lockstep:
         for process in self._processes:
             process.close()
 
-    def _check_processes(self, *, finally_: bool = False) -> None:
+    def _check_processes(self) -> None:
         for process in self._processes:
-            process.check(finally_=finally_)
+            process.check()
+
+    def _check_lost(self) -> None:
+        for process in self._processes:
+            process.check_lost(now=True)
 
     def _check_open(self) -> None:
         if Lockstep._open is not self:
@@ -490,7 +494,7 @@ class Lockstep:
         if self._properties:
             # Not otherwise: a test may have passed because a callback raises what it expects.
             self.settle()
-        self._check_processes(finally_=True)
+        self._check_lost()
         self._properties.finish()
         self.check_faults()
 

@@ -18,7 +18,7 @@ from rclpy.action import ActionServer
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
@@ -164,7 +164,30 @@ class Counting(Node):
         return self.action.Result(sequence=feedback.sequence)
 
 
+class Repeater(Node):
+    """Publishes what it receives, as often as its parameter says."""
+
+    def __init__(self, name, profile=10):
+        super().__init__(name)
+        self.declare_parameter('times', 1)
+        self.out = self.create_publisher(String, f'{name}/out', profile)
+        self.create_subscription(String, f'{name}/in', self.repeat, profile)
+
+    def repeat(self, message):
+        for _ in range(self.get_parameter('times').value):
+            self.out.publish(message)
+
+
 # --- Attacks
+
+
+class Changing(Repeater):
+    """Publishes with another quality of service after the first message."""
+
+    def repeat(self, message):
+        super().repeat(message)
+        self.destroy_publisher(self.out)
+        self.out = self.create_publisher(String, f'{self.get_name()}/out', qos_profile_sensor_data)
 
 
 class Sleeping(Controller):
@@ -256,6 +279,9 @@ class Done(Mortal):
 
 
 NODES = {
+    'repeater': Repeater,
+    'best_effort': lambda name: Repeater(name, qos_profile_sensor_data),
+    'changing': Changing,
     'echo': Controller,
     'mute': lambda name: Controller(name, answers=0),
     'double': lambda name: Controller(name, answers=2),

@@ -27,7 +27,7 @@ from support.processes import PROGRAM
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.faults import ClockPause, Corrupt, Delay, Hang, Kill, Loss, Slow, TimeJump
-from diffdrive_jacobian.lockstep.external import node_process
+from diffdrive_jacobian.lockstep.external import datagrams, node_process
 from diffdrive_jacobian.lockstep.external import process as external_process
 from diffdrive_jacobian.lockstep.external import quiet as quietness
 from diffdrive_jacobian.lockstep.external.process import ExternalProcess
@@ -316,6 +316,16 @@ def test_a_process_is_killed_and_started_again(lockstep):
     assert len(ticks) > 12
 
 
+def test_a_process_that_is_stopped_while_a_fault_has_killed_it_is_not_started_again(lockstep):
+    echo = lockstep.start(command('echo'))
+    lockstep.inject(Kill('echo', start=0.1, duration=0.2))
+    lockstep.run_for(0.2)
+    echo.stop()
+    lockstep.run_for(0.3)
+    assert 'echo' not in [node.get_name() for node in lockstep.nodes]
+    assert echo.returncode is not None
+
+
 def test_the_clock_jumps_and_stands_still_for_processes_too(lockstep):
     lockstep.start(command('ticker'))
     commands = lockstep.listen(TwistStamped, 'ticker/cmd_vel')
@@ -364,6 +374,51 @@ def test_a_callback_that_sleeps_or_waits_is_waited_for(lockstep, name):
     for number in range(10):
         lockstep.publish(f'{name}/odom', odometry(float(number)))
         assert speeds(commands) == list(range(number + 1))
+
+
+@pytest.mark.parametrize('name', ['repeater', 'best_effort'])
+def test_large_messages_and_many_at_once_arrive_complete(lockstep, name):
+    lockstep.start([*command(name), '--ros-args', '-p', 'times:=3'])
+    received = lockstep.listen(String, f'{name}/out')
+    texts = [str(digit) * 700_000 for digit in range(3)]
+    for text in texts:
+        lockstep.publish(f'{name}/in', String(data=text))
+    assert [one.data for one in received] == [text for text in texts for _ in range(3)]
+
+
+def lose(world, name):
+    for _ in range(3):
+        world.publish(f'{name}/in', String(data='x' * 700_000))
+    world.finish()
+
+
+@pytest.mark.parametrize('name', ['repeater', 'best_effort'])
+def test_messages_that_do_not_fit_into_the_queue_of_a_socket_are_an_error(monkeypatch, name):
+    monkeypatch.setattr(datagrams, 'QUEUE', 50_000)
+    monkeypatch.setattr(datagrams, 'SO_RCVBUFFORCE', socket.SO_RCVBUF)
+    with Lockstep() as world:
+        world.start(command(name))
+        with pytest.raises(LockstepError, match=rf'messages to or from /{name} were lost .*rmem_max='):
+            lose(world, name)
+
+
+def test_more_messages_at_once_than_are_received_are_an_error():
+    with Lockstep() as world:
+        world.start([*command('repeater'), '--ros-args', '-p', 'times:=1000'])
+        with pytest.raises(LockstepError, match=r'more than 999 messages .* on /repeater/out at once'):
+            world.publish('repeater/in', String(data='x'))
+
+
+def change(world):
+    world.publish('changing/in', String(data='x'))
+    world.run_for(10.0)
+
+
+def test_a_topic_that_changes_its_quality_of_service_is_an_error():
+    with Lockstep() as world:
+        world.start(command('changing'))
+        with pytest.raises(LockstepError, match=r'/changing/out with several qualities.*BEST_EFFORT'):
+            change(world)
 
 
 @pytest.mark.parametrize('name', ['wall_timer', 'threaded'])
@@ -557,13 +612,36 @@ def test_a_process_that_ends_without_an_error_leaves_the_world(lockstep):
 
 
 def test_start_takes_a_program_and_its_arguments(lockstep):
-    for wrong in ('ros2 run package node', [], ()):
+    for wrong in ('ros2 run package node', [], (), ['ros2', 3], ['a\0b'], 3, b'ab', None):
         with pytest.raises(LockstepError, match='start takes a program and its arguments'):
             lockstep.start(wrong)
     with pytest.raises(LockstepError, match=r'cannot be started: .*No such file'):
         lockstep.start(['no_such_program'])
     with pytest.raises(ValueError, match='clock_period must be'):
         lockstep.start(['true'], clock_period=0.0)
+    for name, wrong in [
+        *(('env', env) for env in (3, {'A': 1}, {'A=B': 'x'}, {'': 'x'}, {'A': '\0'}, {1: 'x'})),
+        *(('queue_depth', depth) for depth in (0, -3, 2.5, True, '10', 1000)),
+        *(('cwd', cwd) for cwd in (3, 'a\0b')),
+    ]:
+        with pytest.raises(LockstepError, match=rf'{name} must be .*, got '):
+            lockstep.start(['true'], **{name: wrong})
+    for cwd in ('/no/such/folder', __file__):
+        with pytest.raises(LockstepError, match=r'cannot be started: .*(No such|Not a)'):
+            lockstep.start(['true'], cwd=cwd)
+
+
+def test_what_a_process_has_printed_is_quoted_in_part():
+    long = "import sys; print('\\033[2J', 'x' * 10**6, file=sys.stderr); sys.exit(3)"
+    with Lockstep() as world, pytest.raises(LockstepError, match='has exited with 3') as raised:
+        world.start([sys.executable, '-c', long])
+    assert len(str(raised.value)) < 3000
+    assert '\033' not in str(raised.value)
+
+
+def test_a_program_that_goes_into_the_background_is_told_not_to():
+    with Lockstep() as world, pytest.raises(LockstepError, match='start it in the foreground'):
+        world.start(['sh', '-c', 'sleep 60 &'])
 
 
 def test_another_system_is_refused(lockstep, monkeypatch):
@@ -685,7 +763,8 @@ def test_runs_that_differ_are_an_error():
 
     with pytest.raises(
         LockstepError,
-        match=r'run 2 differs from run 1, first in message 2: /value at 1.5 s .* instead of /value',
+        match=r'run 2 differs from run 1, first in message 2: /value at 1.5 s: Float64\(data=2\) .*'
+        r'instead of /value at 1.5 s: Float64\(data=1\)',
     ):
         check_repeats(run)
     lengths = iter([1.0, 2.0])
@@ -695,5 +774,5 @@ def test_runs_that_differ_are_an_error():
         world.node.create_timer(1.0, lambda: publisher.publish(Float64()))
         world.run_for(next(lengths))
 
-    with pytest.raises(LockstepError, match=r'/value at 3 s .* instead of none'):
+    with pytest.raises(LockstepError, match=r'/value at 3 s: .* instead of none'):
         check_repeats(longer)

@@ -263,6 +263,7 @@ class NodeProcess:
         if self._connected:
             self._wait()
             self._forward(self._take())
+            self.check_lost(now=True)
         self._leave()
         return code
 
@@ -485,8 +486,8 @@ class NodeProcess:
         if others:
             found = sorted(f'{one.name} and {other.name}' for one, other in known)
             raise LockstepError(
-                f'{self.child.title} uses {topic} with several qualities of service, at once or one after '
-                f'the other: {", ".join(found)}; nodes in other processes may use one for each topic'
+                f'{self.child.title} uses {topic} with several qualities of service, at once or one '
+                f'after the other: {", ".join(found)}; a process may use one for each topic'
             )
         return QoSProfile(depth=depth, reliability=reliability, durability=durability)
 
@@ -644,7 +645,7 @@ class NodeProcess:
         send()
         self._wait()
         arrived = self._take()
-        self._check_lost()
+        self.check_lost()
         for sent in self._sent.values():
             sent.clear()
         self._extend(time.monotonic() - begin)
@@ -691,24 +692,24 @@ class NodeProcess:
         for one in arrived:
             one.forward()
 
-    def check(self, *, finally_: bool = False) -> None:
-        """Check that it runs, has lost nothing, and has sent nothing while nothing was delivered to it.
-
-        Args:
-            finally_: Whether this is the last check.
-        """
+    def check(self) -> None:
+        """Check that it runs, lost nothing, and has sent nothing while nothing was delivered to it."""
         if self._connected:
             self.child.check_running(', '.join(self._stand_ins))
             self._refuse(self._take())
-            self._check_lost(now=finally_)
+            self.check_lost()
 
-    def _check_lost(self, *, now: bool = False) -> None:
-        """Raise LockstepError if messages between the world and the process are known to be lost."""
-        if self._datagrams.lost(now=now):
+    def check_lost(self, *, now: bool = False) -> None:
+        """Raise LockstepError if messages between the world and the process are known to be lost.
+
+        Args:
+            now: Whether to look, even if that was done just before.
+        """
+        if self._connected and self._datagrams.lost(now=now):
             raise LockstepError(
                 f'messages to or from {", ".join(self._stand_ins)} were lost at '
-                f'{self._clocks.now / NANOSECONDS:g} s or before: more was sent at once than a socket can '
-                f'hold; {LIMIT} allows {Path(LIMIT).read_text().strip()} bytes, and may need '
+                f'{self._clocks.now / NANOSECONDS:g} s or before: more was sent at once than a socket '
+                f'can hold; {LIMIT} allows {Path(LIMIT).read_text().strip()} bytes, and may need '
                 f'{QUEUE}: sysctl -w net.core.rmem_max={QUEUE}'
             )
 

@@ -123,6 +123,8 @@ class ExternalProcess:
                 start_new_session=True,
             )
         except OSError as error:
+            for file in self._files:
+                file.close()
             raise LockstepError(f'{self.title} cannot be started: {error}') from error
         self.root = self._process.pid
         """Id of the process from which all others descend."""
