@@ -12,6 +12,7 @@ from rclpy.publisher import Publisher
 from diffdrive_jacobian.messages.fields import is_stamp, plain, walk
 from diffdrive_jacobian.messages.structure import Array, FieldType, Sequence, Structure, Text, structure
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
+from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 MAX_SHOWN = 4
 """Number of elements that are shown of an array."""
+MAX_TEXT = 80
+"""Most characters of a text field that are shown."""
 MAX_CHECKED = 100
 """Length up to which arrays of zeros are omitted. Longer ones are not searched."""
 
@@ -99,7 +102,7 @@ def _shown(kind: FieldType, value: Any) -> str:
             zero = len(value) <= MAX_CHECKED and all(_is_zero(one) for one in value)
             return '' if zero else _array(element, value)
         case Text():
-            return repr(value) if value else ''
+            return printable(repr(value), MAX_TEXT) if value else ''
         case _:
             return '' if _is_zero(value) else _scalar(kind, value)
 

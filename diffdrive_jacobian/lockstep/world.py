@@ -99,6 +99,7 @@ class Lockstep:
         try:
             self._compose(args, patience)
         except BaseException:
+            withdraw()
             Lockstep._open = None
             self._closing.close()
             raise
@@ -114,7 +115,6 @@ class Lockstep:
         except UserError as error:
             raise LockstepError(str(error)) from error
         refuse_init(context, _refuse_init)
-        withdraw()
         self._scheduler = scheduler = Scheduler(context, self._start)
         self._closing.callback(self._destroy_nodes)
         self._closing.callback(scheduler.links.close)
@@ -124,6 +124,8 @@ class Lockstep:
             raise LockstepError('Lockstep must be created and used in the main thread') from error
         self._closing.callback(guard.close)
         self._nodes = Nodes(scheduler)
+        # With its first node the context gets its participant.
+        withdraw()
         self.node = self._nodes.own
         """Node for the publishers, subscriptions and clients of a test."""
         self._time = SimulatedTime(

@@ -13,14 +13,16 @@ from typing import Any, NamedTuple
 
 from rclpy.client import Client
 from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._link import is_latched
 from diffdrive_jacobian.lockstep.external.graph import reliable
 from diffdrive_jacobian.ros.rclpy_internals import (
+    lost_messages,
     message_taker,
     raw_sender,
     send_request,
@@ -84,7 +86,11 @@ def from_topic(
         profile: Quality of service that the process offers.
         sent: What the world sends to the process now. That arrives here, too, and is not forwarded.
     """
-    subscription = outside.create_subscription(kind, topic, _nothing, profile, raw=True)
+    events = SubscriptionEventCallbacks(message_lost=_nothing, use_default_callbacks=False)
+    subscription = outside.create_subscription(
+        kind, topic, _nothing, profile, raw=True, event_callbacks=events
+    )
+    may_lose = profile.reliability == ReliabilityPolicy.BEST_EFFORT
     take_next, release = message_taker(subscription)
     publisher = inside.create_publisher(kind, topic, profile)
 
@@ -103,6 +109,10 @@ def from_topic(
                 sent.remove(data)
             else:
                 yield Arrived(f'published {topic}', latched, partial(publisher.publish, data))
+        if number and may_lose and lost_messages(subscription):
+            raise LockstepError(
+                f'messages on {topic} were lost: several were published at once, with best effort'
+            )
 
     return Relay(subscription.get_publisher_count, take, release)
 
