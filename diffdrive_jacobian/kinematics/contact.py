@@ -37,9 +37,6 @@ def wheel_contact_position(x: Number, phi: Number, r: Number) -> Entries:
 
     Returns:
         `[along, up, sideways]`, shape (..., 3) (m).
-
-    Raises:
-        ValueError: r is not positive and finite, or x or phi is not finite.
     """
     return [x + r * sin(phi), r + r * cos(phi), 0.0]
 
@@ -54,9 +51,6 @@ def wheel_contact_jacobian(phi: Number, r: Number) -> Rows:
 
     Returns:
         The Jacobian, shape (..., 3, 2). At phi = pi its null space is the rolling condition.
-
-    Raises:
-        ValueError: r is not positive and finite, or phi is not finite.
     """
     return [
         [1.0, r * cos(phi)],
@@ -74,8 +68,5 @@ def rolling_direction(r: Number) -> Entries:
 
     Returns:
         `[x_dot, phi_dot]` for one radian per second, shape (..., 2) (m/s, rad/s).
-
-    Raises:
-        ValueError: r is not positive and finite.
     """
     return [r, 1.0]

@@ -72,9 +72,6 @@ def wheel_to_body_jacobian(r: Number, L: Number) -> Rows:
 
     Returns:
         J_w, shape (..., 2, 2), over `[omega_R, omega_L]`.
-
-    Raises:
-        ValueError: r or L is not positive and finite.
     """
     return [
         [r / 2.0, r / 2.0],
@@ -92,9 +89,6 @@ def body_to_wheel_jacobian(r: Number, L: Number) -> Rows:
 
     Returns:
         The inverse of `wheel_to_body_jacobian`, shape (..., 2, 2).
-
-    Raises:
-        ValueError: r or L is not positive and finite.
     """
     return [
         [1.0 / r, L / (2.0 * r)],
@@ -113,9 +107,6 @@ def wheel_to_world_jacobian(theta: Number, r: Number, L: Number) -> Rows:
 
     Returns:
         The product, shape (..., 3, 2), rank 2.
-
-    Raises:
-        ValueError: r or L is not positive and finite.
     """
     S = unicycle_jacobian.formula(theta)
     J_w = wheel_to_body_jacobian.formula(r, L)
@@ -132,9 +123,6 @@ def single_wheel_jacobian(theta: Number, r: Number) -> Rows:
 
     Returns:
         `[[r cos, 0], [r sin, 0], [0, 1]]`, shape (..., 3, 2), over `[omega_wheel, theta_dot]` (rad/s).
-
-    Raises:
-        ValueError: r is not positive and finite.
     """
     return [
         [r * cos(theta), 0.0],
@@ -158,9 +146,6 @@ def wheel_to_position_jacobian(theta: Number, r: Number, L: Number) -> Rows:
 
     Returns:
         The Jacobian, shape (..., 2, 2), over `[omega_R, omega_L]`. Its determinant is exactly 0.
-
-    Raises:
-        ValueError: r or L is not positive and finite.
     """
     S = unicycle_jacobian.formula(theta)
     J_w = wheel_to_body_jacobian.formula(r, L)
@@ -177,9 +162,6 @@ def offset_point(pose: Vector, d: Number) -> Entries:
 
     Returns:
         The points in the world, shape (..., 2) (m).
-
-    Raises:
-        ValueError: Something is not finite, or shapes do not broadcast.
     """
     x, y, theta = pose
     return [x + d * cos(theta), y + d * sin(theta)]
@@ -200,9 +182,6 @@ def offset_point_jacobian(theta: Number, r: Number, L: Number, d: Number) -> Row
 
     Returns:
         The Jacobian, shape (..., 2, 2), over `[omega_R, omega_L]`.
-
-    Raises:
-        ValueError: r or L is not positive and finite, d is 0 or not finite.
     """
     R = [
         [cos(theta), -sin(theta)],
@@ -228,10 +207,6 @@ def body_to_wheel(v: Number, omega: Number, r: Number, L: Number) -> tuple[Numbe
 
     Returns:
         `(omega_R, omega_L)`, each of shape (...) (rad/s).
-
-    Raises:
-        ValueError: r or L is not positive and finite, v or omega is not finite, shapes do not
-            broadcast, or a wheel speed overflows.
     """
     omega_R = (v + omega * L / 2.0) / r
     omega_L = (v - omega * L / 2.0) / r
@@ -250,10 +225,6 @@ def wheel_to_body(omega_R: Number, omega_L: Number, r: Number, L: Number) -> tup
 
     Returns:
         `(v, omega)`, each of shape (...) (m/s, rad/s).
-
-    Raises:
-        ValueError: r or L is not positive and finite, a wheel speed is not finite, shapes do not
-            broadcast, or v or omega overflows.
     """
     v = r * (omega_R + omega_L) / 2.0
     omega = r * (omega_R - omega_L) / L
@@ -272,9 +243,6 @@ def wheel_centres(pose: Vector, L: Number) -> Rows:
 
     Returns:
         `[[x_R, y_R], [x_L, y_L]]`, shape (..., 2, 2) (m). Document E has them as `C_2` and `C_1`.
-
-    Raises:
-        ValueError: L is not positive and finite, or the pose is not finite.
     """
     x, y, theta = pose
     return [
@@ -297,9 +265,6 @@ def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
 
     Returns:
         Velocities in the world, the right wheel's first, shape (..., 2, 2) (m/s).
-
-    Raises:
-        ValueError: L is not positive and finite, or theta or q_dot is not finite.
     """
     x_dot, y_dot, theta_dot = q_dot
     turning = L / 2.0 * theta_dot
@@ -375,9 +340,6 @@ def rolling_constraints(theta: Number, r: Number, L: Number) -> tuple[Rows, Rows
 
     Returns:
         `(A_q, A_w)`, shapes (..., 3, 3) and (..., 3, 2).
-
-    Raises:
-        ValueError: r or L is not positive and finite.
     """
     A_q = [
         [sin(theta), -cos(theta), 0.0],

@@ -75,9 +75,6 @@ def pose_difference(target: Vector, pose: Vector) -> Entries:
 
     Returns:
         `target - pose`, shape (..., 3), the heading wrapped to (-pi, pi].
-
-    Raises:
-        ValueError: A shape is wrong, or an entry is infinite or NaN.
     """
     x, y, heading = target
     x_is, y_is, heading_is = pose

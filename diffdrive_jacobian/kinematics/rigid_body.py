@@ -28,9 +28,6 @@ def point_velocity(v: Vector, omega: Vector, offset: Vector) -> Entries:
 
     Returns:
         Velocities of Q, shape (..., 3) (m/s).
-
-    Raises:
-        ValueError: Something is not finite, or shapes do not broadcast.
     """
     v_x, v_y, v_z = v
     omega_x, omega_y, omega_z = omega

@@ -44,9 +44,6 @@ def wrap_angle(angle: Number) -> Number:
 
     Returns:
         The wrapped angles, same shape (rad).
-
-    Raises:
-        ValueError: An angle is infinite or NaN.
     """
     return wrap(angle)
 
@@ -60,9 +57,6 @@ def sinc(angle: Number) -> Number:
 
     Returns:
         The quotients, same shape.
-
-    Raises:
-        ValueError: An angle is infinite or NaN.
     """
     return elementary.sinc(angle)
 

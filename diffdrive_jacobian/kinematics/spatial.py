@@ -1,8 +1,8 @@
 """The spatial displacement between two poses in space: six numbers, the error of document D.
 
 A pose is a homogeneous transform `[[R, p], [0, 1]]`, shape (4, 4), with the rotation matrix R and the
-position p (m). Everything broadcasts over leading axes. In the plane the same displacement is
-`se2.compose(se2.inverse(pose), target)`.
+position p (m). Everything broadcasts over leading axes. Other matrices raise ValueError. In the plane
+the same displacement is `se2.compose(se2.inverse(pose), target)`.
 
 Source: document D, 6; doc/mathematics.md, "Inverse kinematics".
 """
@@ -54,9 +54,6 @@ def spatial_displacement(T: Any, T_desired: Any) -> Array:
         `[t_x, t_y, t_z, v_x theta, v_y theta, v_z theta]` in the frame E, shape (..., 6) (m, rad): the
         translation, and the axis v of the rotation times its angle theta, 0 to pi. At pi the sign of v
         is one of both.
-
-    Raises:
-        ValueError: An argument is no homogeneous transform.
     """
     R_transposed = transposed(T[:3, :3])
     t = times(R_transposed, T_desired[:3, 3] - T[:3, 3])  # R^T (p_desired - p)

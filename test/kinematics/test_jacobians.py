@@ -241,10 +241,10 @@ CASES = [
         )
         for links in (1, 3)
     ),
-    ('manipulability.manipulability_gradient', manipulability, {'links': 2, 'heading': False}),
-    ('manipulability.manipulability_gradient', manipulability, {'links': 3, 'heading': False}),
-    ('manipulability.manipulability_gradient', manipulability, {'links': 4, 'heading': True}),
-    ('joint_limits.joint_limit_gradient', joint_limit, {}),
+    ('inverse_velocity.manipulability_gradient', manipulability, {'links': 2, 'heading': False}),
+    ('inverse_velocity.manipulability_gradient', manipulability, {'links': 3, 'heading': False}),
+    ('inverse_velocity.manipulability_gradient', manipulability, {'links': 4, 'heading': True}),
+    ('inverse_velocity.joint_limit_gradient', joint_limit, {}),
     ('planar_arm.PlanarArm.clearance_gradient', clearance, {'links': 3}),
 ]
 
