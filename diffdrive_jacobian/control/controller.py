@@ -28,7 +28,6 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from diffdrive_jacobian.control.path import Reference
-from diffdrive_jacobian.control.sampling import rate_warning
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import (
@@ -261,6 +260,10 @@ class Controller(ControlLaw):
     def rate_warnings(self, gains: GainValues, rate: float, *, turns: bool) -> list[str]:
         """Return the warnings about gains that are too large for the rate of the odometry.
 
+        A law whose yaw rate has the slope K over the heading multiplies an error of the heading by
+        `1 - K / rate` from one sample to the next. So the robot arrives with a slope below twice the
+        rate, and if its commands take effect up to one sample late, below the rate.
+
         Args:
             gains: The gains.
             rate: Rate of the odometry, at which the law is evaluated (Hz).
@@ -268,10 +271,16 @@ class Controller(ControlLaw):
         """
         try:
             slope = 0.0 if self.slope is None else float(self.slope(gains))
-            warning = rate_warning(max(slope, gains.kp if turns else 0.0), rate)
+            slope = max(slope, gains.kp if turns else 0.0)
         except Exception as error:
-            warning = f'the slope of controller {self.name!r} failed: {_reason(error)}'
-        return [warning] if warning else []
+            return [f'the slope of controller {self.name!r} failed: {_reason(error)}']
+        if slope < rate:
+            return []
+        return [
+            f'the law turns by up to {slope:.3g} rad/s per rad of heading, which is not below the '
+            f'odometry rate of {rate:.3g} Hz: if commands take effect up to one sample late, the robot '
+            'may never arrive; choose a smaller kp or kv, or a higher rate'
+        ]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

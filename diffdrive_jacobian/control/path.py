@@ -18,7 +18,7 @@ Source: Bolton 1975, "Biarc curves"; Fritsch and Carlson 1980 for the times.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import cos, floor, sin
+from math import cos, floor, hypot, nan, sin
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -307,6 +307,33 @@ class Path:
         a_n = curvature * v * v
         ax, ay = v_dot * cos(theta) - a_n * sin(theta), v_dot * sin(theta) + a_n * cos(theta)
         return Reference(x, y, theta, v, curvature * v, ax, ay, s if self.closed else inside)
+
+
+@dataclass(slots=True)
+class PathProgress:
+    """How far a robot is along a path and from it, as seen by somebody who does not drive it."""
+
+    path: Path
+    s: float = 0.0
+    """Arc length of the point nearest to the robot (m)."""
+    across: float = 0.0
+    """Distance from that point, positive to the left of the path (m)."""
+    heading: float = 0.0
+    """Heading of the robot minus that of the path there (rad)."""
+    greatest: float = nan
+    """Greatest absolute distance so far (m); NaN: no pose was taken."""
+
+    def moved(self, pose: Any) -> None:
+        """Take a pose of the robot, `[x, y, theta]` (m, m, rad)."""
+        self.s = self.path.nearest(pose[0], pose[1], self.s)
+        errors = Path.errors(pose, self.path.at(self.s, 0.0))
+        self.across, self.heading = float(errors.across), float(errors.heading)
+        self.greatest = float(np.fmax(self.greatest, abs(self.across)))
+
+    @property
+    def remaining(self) -> float:
+        """Arc length to the end and distance from the path together, as in a right triangle (m)."""
+        return hypot(self.path.length - self.s, self.across)
 
 
 def _times(times: ArrayLike, count: int) -> Floats:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from diffdrive_jacobian.control.controller import BoundLaw
-from diffdrive_jacobian.control.go_to_goal import turn_in_place
+from diffdrive_jacobian.control.goal_laws import turn_in_place
 from diffdrive_jacobian.control.path import Path, Reference
 from diffdrive_jacobian.control.waypoints import Law
 from diffdrive_jacobian.numerics.checks import NotNegative, Positive

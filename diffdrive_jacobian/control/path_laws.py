@@ -2,7 +2,9 @@
 
 State: pose `[x, y, theta]` (m, m, rad). Reference: a `path.Reference`, `[x, y, theta, v, omega, ax, ay,
 s]`, the place on the path that the law drives to, with the speeds and the acceleration there. Output:
-body twist `v, omega` (m/s, rad/s). Everything broadcasts over leading axes, the gains too.
+body twist `v, omega` (m/s, rad/s). Everything broadcasts over leading axes, the gains too. A last axis
+of a wrong length, values that are not finite or out of their range, shapes that do not broadcast, and
+twists that overflow raise ValueError.
 
 Source: Coulter 1992; Kanayama, Kimura, Miyazaki, Noguchi 1990; document B; Oriolo, De Luca, Vendittelli
 2002; doc/mathematics.md, "Control laws".
@@ -49,10 +51,6 @@ def pure_pursuit(state: Vector, reference: Vector, l_d: Number) -> tuple[Number,
 
     Returns:
         `(v, omega)`, each of shape (...) (m/s, rad/s).
-
-    Raises:
-        ValueError: l_d is not positive, the last axis of state or reference has a wrong length, shapes
-            do not broadcast, something is not finite, or the twist overflows.
     """
     x, y, theta = state
     x_r, y_r, _, v_r, *_ = reference
@@ -102,10 +100,6 @@ def kanayama(
 
     Returns:
         `(v, omega)`, each of shape (...) (m/s, rad/s).
-
-    Raises:
-        ValueError: A gain is negative, the last axis of state or reference has a wrong length, shapes do
-            not broadcast, something is not finite, or the twist overflows.
     """
     x, y, theta = state
     x_r, y_r, theta_r, v_r, omega_r, *_ = reference
@@ -159,10 +153,6 @@ def offset_point_tracking(
 
     Returns:
         `(v, omega)`, each of shape (...) (m/s, rad/s).
-
-    Raises:
-        ValueError: d is 0, the last axis of state or reference has a wrong length, shapes do not
-            broadcast, something is not finite, or the twist overflows.
     """
     _, _, theta = state
     x_r, y_r, theta_r, v_r, omega_r, *_ = reference
@@ -229,10 +219,6 @@ def dynamic_feedback_linearization(
 
     Returns:
         `(v, omega, state)`, of shapes (...), (...) and (..., 1) (m/s, rad/s, m/s).
-
-    Raises:
-        ValueError: The last axis of an argument has a wrong length, shapes do not broadcast, something
-            is not finite, or the twist overflows.
     """
     x, y, theta = pose
     x_r, y_r, theta_r, v_r, _, ax_r, ay_r, _ = reference

@@ -14,10 +14,9 @@ from typing import Annotated, Any
 import numpy as np
 
 from diffdrive_jacobian.numerics.checks import (
+    Comparable,
     anything,
     constant,
-    equal,
-    hashable,
     leading,
     not_negative_or_infinite,
     not_positive_or_infinite,
@@ -25,7 +24,7 @@ from diffdrive_jacobian.numerics.checks import (
     positive_or_infinite,
 )
 from diffdrive_jacobian.numerics.elementary import maximum, minimum, where
-from diffdrive_jacobian.numerics.fields import Checked, instance
+from diffdrive_jacobian.numerics.fields import instance
 from diffdrive_jacobian.numerics.formula import Number, formula
 
 ROUNDING = 2.0**-49
@@ -33,7 +32,7 @@ ROUNDING = 2.0**-49
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class VelocityLimits(Checked):
+class VelocityLimits(Comparable):
     """Velocity limits of a differential drive; infinity means no limit. Each is a number, or an array
     for several robots that broadcasts with the commands. Immutable, comparable and hashable.
 
@@ -55,18 +54,8 @@ class VelocityLimits(Checked):
 
     def __post_init__(self) -> None:
         """Check every limit."""
-        Checked.__post_init__(self)
+        Comparable.__post_init__(self)
         leading(**{name: np.shape(limit) for name, limit in zip(self.names(), self.all(), strict=True)})
-
-    def __eq__(self, other: object) -> bool:
-        """Compare every limit, arrays by shape and entries."""
-        if not isinstance(other, VelocityLimits):
-            return NotImplemented
-        return all(map(equal, self.all(), other.all()))
-
-    def __hash__(self) -> int:
-        """Return a hash that equal limits share."""
-        return hash(tuple(map(hashable, self.all())))
 
     @property
     def unlimited(self) -> bool:

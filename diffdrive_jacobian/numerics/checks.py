@@ -5,6 +5,7 @@ Those that need no NumPy are in `fields`.
 
 from __future__ import annotations
 
+import dataclasses
 import operator
 from collections.abc import Callable
 from functools import partial
@@ -229,14 +230,25 @@ def constant(name: str, value: Any, check: Callable[[str, Any], None]) -> Any:
     return result
 
 
-def equal(first: Any, second: Any) -> bool:
-    """Return whether numbers or arrays have equal shapes and entries. NaN equals NaN."""
-    return bool(np.array_equal(first, second, equal_nan=True))
+class Comparable(fields.Checked):
+    """Base class of frozen dataclasses whose fields are scalars or arrays, compared by their entries."""
 
+    __slots__ = ()
 
-def hashable(value: Any) -> Any:
-    """Return a hashable object that is equal for equal numbers or arrays."""
-    return value if isinstance(value, float) else (value.shape, *value.ravel().tolist())
+    def __eq__(self, other: object) -> bool:
+        """Compare every field, arrays by shape and entries."""
+        return self._values() == other._values() if type(other) is type(self) else NotImplemented
+
+    def __hash__(self) -> int:
+        """Return a hash that equal values share."""
+        return hash(self._values())
+
+    def _values(self) -> tuple[Any, ...]:
+        values = (getattr(self, field.name) for field in dataclasses.fields(self))  # type: ignore[arg-type]
+        return tuple(
+            (value.shape, *value.ravel().tolist()) if isinstance(value, np.ndarray) else value
+            for value in values
+        )
 
 
 def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
+from diffdrive_jacobian.control.goal_laws import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.numerics.checks import floats
 from diffdrive_jacobian.numerics.elementary import wrap

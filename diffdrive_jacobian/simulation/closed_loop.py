@@ -2,7 +2,7 @@
 
 Every robot is sampled at the control rate. At each sample it either has arrived, or its law returns a
 body twist `[v, omega]` (m/s, rad/s). The twist is saturated, freed of whole turns per sample
-(`control.sampling.without_whole_turns`) and applied along the exact arc until the next sample. This is
+(`control.goal_laws.without_whole_turns`) and applied along the exact arc until the next sample. This is
 the loop of go_to_goal and virtual_robot without delay. With `actuators` robots take time to follow, as
 `Robot` does.
 
@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import Controller, Law
+from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import function
 from diffdrive_jacobian.simulation._batch import Array, Batch, Outcomes, Rows
