@@ -46,14 +46,10 @@ def _rigid(name: str, T: Array) -> None:
 def spatial_displacement(T: Any, T_desired: Any) -> Array:
     """Return the displacement from a pose to another one: `Delta = (t, v theta)` (D, 6).
 
-    Args:
-        T: The pose of the end effector E, shape (..., 4, 4).
-        T_desired: Its desired pose, shape (..., 4, 4).
-
-    Returns:
-        `[t_x, t_y, t_z, v_x theta, v_y theta, v_z theta]` in the frame E, shape (..., 6) (m, rad): the
-        translation, and the axis v of the rotation times its angle theta, 0 to pi. At pi the sign of v
-        is one of both.
+    For poses T of the end effector E and desired ones, T_desired, shape (..., 4, 4), the result is
+    `[t_x, t_y, t_z, v_x theta, v_y theta, v_z theta]` in the frame E, shape (..., 6) (m, rad): the
+    translation, and the axis v of the rotation times its angle theta, 0 to pi. At pi the sign of v is
+    one of both.
     """
     R_transposed = transposed(T[:3, :3])
     t = times(R_transposed, T_desired[:3, 3] - T[:3, 3])  # R^T (p_desired - p)
