@@ -1,8 +1,9 @@
 """Joint velocities from task velocities, for every Jacobian: square, redundant, singular.
 
-Model: `x_dot = J q_dot`, J of shape (..., m, n), m task velocities and n joint velocities, in whatever
-units J has. Everything broadcasts over leading axes. Wrong shapes, shapes that do not broadcast, values
-that are not finite, and results that overflow raise ValueError.
+Model: `x_dot = J q_dot`, Jacobians J of shape (..., m, n), task velocities x_dot of shape (..., m) and
+joint velocities q_dot of shape (..., n), in whatever units J has. Everything broadcasts over leading
+axes. Wrong shapes, shapes that do not broadcast, values that are not finite, and results that overflow
+raise ValueError.
 
 **Damping.** Without it a task is done as well as the Jacobian allows, however fast the joints must move
 for it. With the damping lambda > 0 joint velocities are bounded and continuous in J. The task is then
@@ -122,17 +123,9 @@ TINY = 1e-290
 def adjugate_inverse(J: Any) -> Rows:
     """Invert by the adjugate: `J^-1 = [[d, -b], [-c, a]] / det(J)` (A, 3.2.1).
 
-    Args:
-        J: Jacobians `[[a, b], [c, d]]`, shape (..., 2, 2). (With larger ones the adjugate loses digits
-            that `numpy.linalg.inv` keeps.)
-
-    Returns:
-        The inverses, same shape.
-
-    Raises:
-        LinAlgError: A Jacobian is singular to working precision: the entries of an inverse would be
-            rounding errors. The message contains its determinant.
-        ValueError: J has another shape, or its determinant overflows.
+    For `J = [[a, b], [c, d]]`, shape (..., 2, 2). (With larger ones the adjugate loses digits that
+    `numpy.linalg.inv` keeps.) One that is singular to working precision raises LinAlgError with its
+    determinant: the entries of an inverse would be rounding errors.
     """
     (a, b), (c, d) = J
     determinant = a * d - b * c
@@ -151,14 +144,7 @@ def pseudoinverse(J: Any, *, weights: Vector = None) -> Array:
     """Return the Moore-Penrose pseudo-inverse J^+ (A, C), or the weighted one.
 
     Where J is singular, `J^+ x_dot` minimises `|x_dot - J q_dot|`. Where it is redundant, `|q_dot|`, or
-    with weights `sum_i w_i q_dot_i^2`: `W^-1/2 (J W^-1/2)^+`.
-
-    Args:
-        J: Jacobians, shape (..., m, n).
-        weights: Weights of the joints, positive, shape (..., n). None: all 1.
-
-    Returns:
-        The pseudo-inverses, shape (..., n, m).
+    with weights, shape (..., n), `sum_i w_i q_dot_i^2`: `W^-1/2 (J W^-1/2)^+`. Shape (..., n, m).
     """
     W_half = root(weights)
     J_plus = svd(J / W_half).inverse()  # (J W^-1/2)^+
@@ -170,17 +156,10 @@ def masked_task(J: Any, x_dot: Vector, mask: Vector) -> tuple[Array, Array]:
     """Weigh the entries of a task, or omit some: `sqrt(M) J` and `sqrt(M) x_dot`.
 
     An arm with fewer joints than entries of the task can only control some of them (D, 2.2). The result
-    is a task for all functions of this module. They then minimise `e^T M e` with the error
-    `e = x_dot - J q_dot`: `damped_least_squares(*masked_task(J, x_dot, mask), damping)`.
-
-    Args:
-        J: Jacobians, shape (..., m, n).
-        x_dot: Task velocities, shape (..., m).
-        mask: Weights of the entries, the diagonal of M, zero or positive, shape (..., m). Zero omits an
-            entry.
-
-    Returns:
-        The Jacobians and the velocities, same shapes, with rows of zeros for omitted entries.
+    is a task for all functions of this module, with rows of zeros for omitted entries. They then
+    minimise `e^T M e` with the error `e = x_dot - J q_dot`: `damped_least_squares(*masked_task(J, x_dot,
+    mask), damping)`. The mask is the diagonal of M, zero or positive, shape (..., m). Zero omits an
+    entry.
     """
     M_half = root(mask)
     return column(M_half) * J, M_half * x_dot  # sqrt(M) J, sqrt(M) x_dot
@@ -190,15 +169,9 @@ def masked_task(J: Any, x_dot: Vector, mask: Vector) -> tuple[Array, Array]:
 def damping(manipulability: Number, threshold: Number, maximum: Number) -> Number:
     """Return a lambda that grows as the manipulability falls: `lambda_max (1 - w / w_0)`, or 0.
 
-    Document A asks for such a lambda without a formula.
-
-    Args:
-        manipulability: w, zero or positive, shape (...).
-        threshold: w_0, below which there is damping, positive, shape (...), in the units of w.
-        maximum: lambda_max, the damping of a singular Jacobian, zero or positive, shape (...).
-
-    Returns:
-        lambda, shape (...), in the units of J: not squared (Nakamura and Hanafusa 1986 square it).
+    Document A asks for such a lambda without a formula. It has the units of J (Nakamura and Hanafusa
+    1986 square it). The manipulability w and the largest lambda, that of a singular Jacobian, are zero
+    or positive; the threshold w_0, below which there is damping, is positive; each of shape (...).
     """
     return maximum * (1.0 - minimum(manipulability / threshold, 1.0))
 
@@ -207,16 +180,8 @@ def damping(manipulability: Number, threshold: Number, maximum: Number) -> Numbe
 def damped_least_squares(J: Any, x_dot: Vector, damping: Number, *, weights: Vector = None) -> Array:
     """Return bounded joint velocities: `J^T (J J^T + lambda^2 I)^-1 x_dot` (A).
 
-    `|q_dot| <= |x_dot| / (2 lambda)` for every J. With lambda = 0 this is `J^+ x_dot`.
-
-    Args:
-        J: Jacobians, shape (..., m, n).
-        x_dot: Task velocities, shape (..., m).
-        damping: lambda, zero or positive, in the units of J, shape (...).
-        weights: Weights of the joints, positive, shape (..., n). None: all 1.
-
-    Returns:
-        Joint velocities, shape (..., n).
+    `|q_dot| <= |x_dot| / (2 lambda)` for every J. With lambda = 0 this is `J^+ x_dot`. The damping
+    lambda, shape (...), is zero or positive, in the units of J. Weights have the shape (..., n).
     """
     W_half = root(weights)
     J = J / W_half  # J W^-1/2
@@ -230,15 +195,8 @@ def null_space_projector(J: Any, damping: Number = 0.0, *, weights: Vector = Non
     """Return the projector to joint velocities that do not move the task: `N = I - J^+ J` (A, C).
 
     Without damping `J N = 0` and `N N = N`, its rank n less the rank of J. With damping N is continuous
-    in J and leaks where singular values are below `FILTER lambda`, see the module.
-
-    Args:
-        J: Jacobians, shape (..., m, n).
-        damping: lambda, zero or positive, in the units of J, shape (...).
-        weights: Weights of the joints, positive, shape (..., n). None: all 1.
-
-    Returns:
-        N, shape (..., n, n), symmetric. With weights `W N` is symmetric.
+    in J and leaks where singular values are below `FILTER lambda`, see the module. N, shape (..., n, n),
+    is symmetric; with weights, shape (..., n), `W N` is.
     """
     W_half = root(weights)
     J = J / W_half  # J W^-1/2
@@ -253,19 +211,9 @@ def redundant(
     """Do a task, and come near to secondary joint velocities: `J^+ x_dot + N q_dot_0` (A, C).
 
     With damping, damped least squares takes the place of J^+, and N is the `null_space_projector` with
-    the same damping. The secondary velocity then moves the task by at most `lambda / 40 |q_dot_0|`, and
-    not at all while no singular value is between 0 and `lambda / 10`.
-
-    Args:
-        J: Jacobians, shape (..., m, n).
-        x_dot: Task velocities, shape (..., m).
-        q_dot_0: Secondary joint velocities, shape (..., n).
-        damping: lambda, zero or positive, in the units of J, shape (...).
-        weights: Weights of the joints, positive, shape (..., n). None: all 1. To go uphill along the
-            gradient of a function with them, divide the gradient by the weights.
-
-    Returns:
-        Joint velocities, shape (..., n): with `q_dot_0 = 0` the least ones.
+    the same damping. The secondary velocities q_dot_0, shape (..., n), then move the task by at most
+    `lambda / 40 |q_dot_0|`, and not at all while no singular value is between 0 and `lambda / 10`. To go
+    uphill along the gradient of a function with weights, shape (..., n), divide the gradient by them.
     """
     W_half = root(weights)
     J, q_dot_0 = J / W_half, W_half * q_dot_0  # J W^-1/2 and W^1/2 q_dot_0
@@ -379,12 +327,8 @@ def _checked(tasks: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[Array, 
 def manipulability(J: Any) -> Array:
     """Return Yoshikawa's distance of a Jacobian from singular: `w = sqrt(det(J J^T))`.
 
-    Args:
-        J: Jacobians, shape (..., m, n).
-
-    Returns:
-        w, shape (...): the product of the singular values, 0 where J is singular. Also 0 where it has
-        more rows than columns, because some velocities cannot be produced then.
+    It is the product of the singular values, shape (...), 0 where J is singular. Also 0 where it has
+    more rows than columns, because some velocities cannot be produced then.
     """
     if len(J) == 2:
         # Cauchy and Binet: det(J J^T) is the sum of the squared minors.
@@ -402,12 +346,8 @@ def manipulability_gradient(jacobian: Callable[[Array], ArrayLike], q: ArrayLike
     configuration, where w is not differentiable, they return the mean of both sides. As a secondary
     task: `redundant(J, x_dot, k * manipulability_gradient(arm.jacobian, q))`, k > 0 (A, 3.2.5).
 
-    Args:
-        jacobian: Returns the Jacobians, shape (..., m, inputs), of configurations of shape (..., n).
-        q: Configurations, shape (..., n) (rad; the base of a mobile manipulator also m).
-
-    Returns:
-        The gradients, shape (..., n).
+    The function returns Jacobians, shape (..., m, inputs), of configurations, shape (..., n) (rad; the
+    base of a mobile manipulator also m). The gradients have the shape (..., n).
     """
     q = array('q', q, 'n')
     steps = STEP * np.eye(q.shape[-1])
@@ -436,13 +376,8 @@ class Ellipsoid(NamedTuple):
 def velocity_ellipsoid(J: ArrayLike) -> Ellipsoid:
     """Return the task velocities `J q_dot` of joint velocities with `|q_dot| <= 1`.
 
-    For joints of different speeds give `J diag(q_dot_max)`.
-
-    Args:
-        J: Jacobians, shape (..., m, n).
-
-    Returns:
-        Axes `s_i u_i`, the longest first. A semi-axis of 0 is a direction in which the task cannot move.
+    For joints of different speeds give `J diag(q_dot_max)`. The axes are `s_i u_i`, the longest first. A
+    semi-axis of 0 is a direction in which the task cannot move.
     """
     U, s = _axes(J)
     return Ellipsoid(U, s)
@@ -451,12 +386,8 @@ def velocity_ellipsoid(J: ArrayLike) -> Ellipsoid:
 def force_ellipsoid(J: ArrayLike) -> Ellipsoid:
     """Return the forces W that joint torques `tau = J^T W` with `|tau| <= 1` balance.
 
-    Args:
-        J: Jacobians, shape (..., m, n).
-
-    Returns:
-        Axes `u_i / s_i`, those of the velocity ellipsoid in the same order, the shortest first. A
-        semi-axis is infinite where the structure carries the force without any torque.
+    The axes are `u_i / s_i`, those of the velocity ellipsoid in the same order, the shortest first. A
+    semi-axis is infinite where the structure carries the force without any torque.
     """
     U, s = _axes(J)
     with np.errstate(divide='ignore', over='ignore'):
@@ -466,11 +397,7 @@ def force_ellipsoid(J: ArrayLike) -> Ellipsoid:
 def smallest_singular_value(J: ArrayLike) -> Array:
     """Return the shortest semi-axis of the velocity ellipsoid, the speed in the slowest direction.
 
-    Args:
-        J: Jacobians, shape (..., m, n).
-
-    Returns:
-        s_m, shape (...), 0 where J is singular or has more rows than columns.
+    s_m, shape (...), is 0 where J is singular or has more rows than columns.
     """
     _, s = _axes(J)
     return np.asarray(s[..., -1])
@@ -479,11 +406,7 @@ def smallest_singular_value(J: ArrayLike) -> Array:
 def condition_number(J: ArrayLike) -> Array:
     """Return the quotient of the longest and the shortest semi-axis of the velocity ellipsoid.
 
-    Args:
-        J: Jacobians, shape (..., m, n).
-
-    Returns:
-        `s_1 / s_m`, shape (...), from 1 for a sphere (isotropic) to infinity where J is singular.
+    `s_1 / s_m`, shape (...), is 1 for a sphere (isotropic) and infinite where J is singular.
     """
     _, s = _axes(J)
     largest, smallest = s[..., 0], s[..., -1]
@@ -508,13 +431,8 @@ def _axes(J: ArrayLike) -> tuple[Array, Array]:
 def joint_limit_cost(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Array:
     """Return how far joints are from the middle of their ranges: `1/(2n) sum(((q - middle) / range)^2)`.
 
-    Args:
-        q: Joint angles, shape (..., n) (rad).
-        lower: Lower limits, shape (..., n), or one for all joints (rad).
-        upper: Upper limits, above the lower ones, shape (..., n), or one for all joints (rad).
-
-    Returns:
-        The cost, shape (...): 0 in the middle, 1/8 with every joint at a limit.
+    For joint angles q, shape (..., n), and limits `lower < upper` of the same shape, or one for all
+    joints (rad), it has the shape (...): 0 in the middle, 1/8 with every joint at a limit.
     """
     q, middle, width = _ranges(q, lower, upper)
     cost = np.asarray(np.mean(((q - middle) / width) ** 2, axis=-1) / 2.0)
@@ -540,15 +458,9 @@ def limit_velocity(q_dot: ArrayLike, max_velocity: ArrayLike) -> Array:
     """Scale joint velocities by the largest factor up to 1 with which no joint exceeds its limit.
 
     All are scaled alike. So every task keeps its direction, a task of velocity 0 is kept, and the result
-    is continuous. The price: tasks of all priorities slow down, also those that do not need the joint
-    at its limit.
-
-    Args:
-        q_dot: Joint velocities, shape (..., n).
-        max_velocity: Largest speeds, positive or infinite, shape (..., n), or one for all joints.
-
-    Returns:
-        Joint velocities, shape (..., n), no entry larger than its limit, not even by rounding.
+    is continuous. The price: tasks of all priorities slow down, also those that do not need the joint at
+    its limit. For q_dot, shape (..., n), and largest speeds, positive or infinite, of the same shape, or
+    one for all joints, no entry of the result is larger than its limit, not even by rounding.
     """
     q_dot = array('q_dot', q_dot, 'n')
     most = _for_all_joints('max_velocity', max_velocity, q_dot.shape[-1])
