@@ -1,8 +1,9 @@
 """Control laws that drive a unicycle to a goal, and a turn in place.
 
-State: pose `[x, y, theta]` (m, m, rad). Output: body twist `v, omega` (m/s, rad/s). Everything
-broadcasts over leading axes, the gains too. A last axis of a wrong length, values that are not finite or
-out of their range, shapes that do not broadcast, and twists that overflow raise ValueError.
+State: pose `[x, y, theta]` (m, m, rad). Output: body twist `(v, omega)`, each of shape (...) (m/s,
+rad/s). Everything broadcasts over leading axes, the gains too. A last axis of a wrong length, values
+that are not finite or out of their range, shapes that do not broadcast, and twists that overflow raise
+ValueError.
 
 Source: document A, equations (9)-(11); document B, "Let's add a control point offset"; M. Aicardi,
 G. Casalino, A. Bicchi, A. Balestrino, "Closed loop steering of unicycle-like vehicles via Lyapunov
@@ -30,8 +31,9 @@ def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Num
     """Compute the twist that drives a unicycle to a position.
 
     `e = wrap(atan2(y_g - y, x_g - x) - theta)`, `omega = Kp e`, `v = Kv d cos(e)`, where d is the
-    distance. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never grows. With
-    `Kp < Kv` the heading error does not converge to zero and the robot spirals in.
+    distance. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never grows. With `Kp <
+    Kv` the heading error does not converge to zero and the robot spirals in. Exactly on the goal, where
+    the heading towards it is undefined, v and omega are zero.
 
     When the law is sampled, the robot arrives with `Kp < 2 rate` and `Kv < rate`, and if commands take
     effect up to one sample late, with `Kp + Kv < rate`. Half of that is recommended.
@@ -41,10 +43,6 @@ def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Num
         goal: Position `[x, y]`, shape (..., 2) (m).
         Kp: Gain on the heading error, shape (...) (1/s).
         Kv: Gain on the distance, shape (...) (1/s).
-
-    Returns:
-        `(v, omega)`, each of shape (...) (m/s, rad/s). Exactly on the goal, where the heading
-        towards it is undefined, both are zero.
     """
     x, y, theta = state
     x_goal, y_goal = goal
@@ -79,18 +77,9 @@ GO_TO_GOAL = Controller(
 def turn_in_place(theta: Number, heading: Number, Kp: Number) -> tuple[Number, Number]:
     """Compute the twist that turns to a heading by the smaller angle.
 
-    `v = 0`, `omega = Kp wrap(heading - theta)`.
-
-    When the law is sampled, it converges with `Kp < 2 rate`. If commands take effect up to one sample
-    late, it converges from rest with `Kp < rate`. Half of that is recommended.
-
-    Args:
-        theta: Heading of the robot, shape (...) (rad).
-        heading: Desired heading, shape (...) (rad).
-        Kp: Gain on the heading error, shape (...) (1/s).
-
-    Returns:
-        `(v, omega)`, each of shape (...) (m/s, rad/s).
+    `v = 0`, `omega = Kp wrap(heading - theta)`, of headings (rad) and the gain Kp (1/s), each of shape
+    (...). When the law is sampled, it converges with `Kp < 2 rate`. If commands take effect up to one
+    sample late, it converges from rest with `Kp < rate`. Half of that is recommended.
     """
     return 0.0, Kp * wrap(heading - theta)
 
@@ -105,22 +94,18 @@ def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Num
     Unlike the axle centre, whose Jacobian has rank 1, a point at a distance in front of it (behind it,
     if d is negative) can be driven in every direction.
 
-    As wheel speeds the law is `w = J_d^-1 k (goal - p_d)`. Here it is the body twist `u = J_w w`:
-    `v = k a`, `omega = k b / d`, where `[a, b]` is the vector from the point to the goal in the body
-    frame. The distance of the point decays as exp(-k t), whatever the heading. The point comes to rest
-    on the goal, the axle centre at a distance |d| from it. When the law is sampled, this requires
-    `k distance < 2 |d| rate` and `k < rate`, and if commands take effect up to one sample late,
-    `k (1 + distance / |d|) < rate`. With a shorter offset the robot turns too far when the goal is far
-    away.
+    As wheel speeds the law is `w = J_d^-1 k (goal - p_d)`. Here it is the body twist `u = J_w w`: `v = k
+    a`, `omega = k b / d`, where `[a, b]` is the vector from the point to the goal in the body frame. The
+    distance of the point decays as exp(-k t), whatever the heading. The point comes to rest on the goal,
+    the axle centre at a distance |d| from it. When the law is sampled, this requires `k distance < 2 |d|
+    rate` and `k < rate`, and if commands take effect up to one sample late, `k (1 + distance / |d|) <
+    rate`. With a shorter offset the robot turns too far when the goal is far away.
 
     Args:
         state: Pose of the robot, shape (..., 3).
         goal: Position for the point `[x, y]`, shape (..., 2) (m).
         k: Gain on the distance, shape (...) (1/s).
         d: X coordinate of the point in the body frame, not 0, shape (...) (m).
-
-    Returns:
-        `(v, omega)`, each of shape (...) (m/s, rad/s).
     """
     x_d, y_d = diff_drive.offset_point.formula(state, d)
     x_goal, y_goal = goal
@@ -171,14 +156,15 @@ def go_to_pose(
 
         rho_dot = -v cos(alpha),  alpha_dot = v sin(alpha) / rho - omega,  phi_dot = v sin(alpha) / rho
 
-    The law is `v = Kv rho cos(alpha)`, as in document A's law, and
-    `omega = Kp alpha + Kv cos(alpha) sin(alpha)/alpha (alpha + h phi)`. In continuous time
-    `V = rho^2 + alpha^2 + h phi^2` never grows, and all three converge to zero.
+    The law is `v = Kv rho cos(alpha)`, as in document A's law, and `omega = Kp alpha + Kv cos(alpha)
+    sin(alpha)/alpha (alpha + h phi)`. In continuous time `V = rho^2 + alpha^2 + h phi^2` never grows,
+    and all three converge to zero. Exactly on the goal's position, where the bearing is undefined, v and
+    omega are zero.
 
     Near the goal, heading and bearing behave like an oscillator of frequency `Kv sqrt(h)` with damping
-    Kp, and the distance decays like exp(-Kv t). For the heading to converge first, Kp should be above
-    2 Kv. A weight larger than necessary leads to longer paths. If the goal lies behind, the robot backs
-    up while it turns to it and then drives forwards. If it may not back up, it turns first.
+    Kp, and the distance decays like exp(-Kv t). For the heading to converge first, Kp should be above 2
+    Kv. A weight larger than necessary leads to longer paths. If the goal lies behind, the robot backs up
+    while it turns to it and then drives forwards. If it may not back up, it turns first.
 
     When the law is sampled with `Kp > 2 Kv`, the robot arrives with `K = Kp + Kv (1 + 2.74 h)` below
     twice the rate, and if commands take effect up to one sample late, with K below the rate. Half of
@@ -189,13 +175,9 @@ def go_to_pose(
         goal: Desired pose `[x, y, theta]`, shape (..., 3).
         Kp: Gain on the bearing, positive, shape (...) (1/s).
         Kv: Gain on the distance, positive, shape (...) (1/s).
-        h: Weight of the heading, positive, shape (...). None:
-            `(Kp / (2 Kv))^2`, which is critical damping, or for `Kp > 4 Kv` the smaller `2 Kp / Kv - 4`,
-            with which the heading decays like exp(-2 Kv t).
-
-    Returns:
-        `(v, omega)`, each of shape (...) (m/s, rad/s). Exactly on the goal's position, where the bearing
-        is undefined, both are zero.
+        h: Weight of the heading, positive, shape (...). None: `(Kp / (2 Kv))^2`, which is critical
+            damping, or for `Kp > 4 Kv` the smaller `2 Kp / Kv - 4`, with which the heading decays like
+            exp(-2 Kv t).
     """
     x, y, theta = state
     x_goal, y_goal, heading = goal
@@ -251,13 +233,7 @@ LARGEST_TURN = 7.0 / 8.0 * tau
 def without_whole_turns(omega: Any, rate: float) -> Any:
     """Return a yaw rate without the whole turns per sample. The heading at the next sample is the same.
 
-    A robot that makes a whole turn per sample comes back to where it was, and so never arrives.
-
-    Args:
-        omega: Yaw rate, shape (...) (rad/s).
-        rate: Sampling rate (Hz).
-
-    Returns:
-        The yaw rate, shape (...) (rad/s); omega itself up to a turn of 7/8 per sample.
+    A robot that makes a whole turn per sample comes back to where it was, and so never arrives. omega
+    (rad/s) of shape (...), sampled at a rate (Hz), is left as it is up to a turn of 7/8 per sample.
     """
     return where(abs(omega) <= LARGEST_TURN * rate, omega, wrap(omega / rate) * rate)

@@ -89,9 +89,8 @@ class _Arcs(NamedTuple):
 class Path:
     """Poses to drive through in order, with times a trajectory. Immutable.
 
-    Raises:
-        ValueError: The poses have another shape than (n, 3) or (n, 2), an entry is not finite, or fewer
-            than two positions differ. The times are not of shape (n), or do not increase.
+    Poses of another shape than (n, 3) or (n, 2) or that are not finite, fewer than two different
+    positions, and times that are not of shape (n) or do not increase raise ValueError.
     """
 
     poses: Floats
@@ -145,10 +144,8 @@ class Path:
     def timed(self, speed: float) -> Path:
         """Return the trajectory along this path with a constant speed (m/s).
 
-        Poses that repeat the position before are left out.
-
-        Raises:
-            ValueError: The speed is not a positive number.
+        Poses that repeat the position before are left out. A speed that is not positive raises
+        ValueError.
         """
         speed = number('speed', speed, positive)
         new = np.concatenate([[True], np.diff(self.arc_lengths) > 0.0])
@@ -157,25 +154,17 @@ class Path:
     def at(self, s: float, speed: float) -> Reference:
         """Return the path at an arc length.
 
-        Args:
-            s: Arc length (m). Before the start of an open path it is the start, after the end the end. A
-                closed path is repeated.
-            speed: Speed along the path, which is constant (m/s).
-
-        Raises:
-            ValueError: An argument is not a finite number.
+        Before the start of an open path s (m) is the start, after the end the end. A closed path is
+        repeated. The speed along the path is constant (m/s). Arguments that are not finite raise
+        ValueError.
         """
         return self._reference(number('s', s, finite), number('speed', speed, finite), 0.0)
 
     def at_time(self, t: float) -> Reference:
         """Return a trajectory at a time: between its poses the speed is continuous.
 
-        Args:
-            t: Time since the first pose (s). Before 0 the robot rests at the first pose, after the
-                duration at the last one.
-
-        Raises:
-            ValueError: t is not a finite number, or the path has no times.
+        Before t = 0 (s) the robot rests at the first pose, after the duration at the last one. A t that
+        is not finite, and a path without times, raise ValueError.
         """
         t = number('t', t, finite)
         if self.times is None:
@@ -187,14 +176,8 @@ class Path:
     def poses_at(self, s: ArrayLike) -> Floats:
         """Return the poses of the path, with the direction of the tangent, at arc lengths as in `at`.
 
-        Args:
-            s: Arc lengths, shape (...) (m).
-
-        Returns:
-            `[x, y, theta]`, shape (..., 3) (m, m, rad).
-
-        Raises:
-            ValueError: An arc length is not finite.
+        Arc lengths s of shape (...) (m) give `[x, y, theta]` of shape (..., 3) (m, m, rad). An arc
+        length that is not finite raises ValueError.
         """
         inside: Floats = self._inside(array('s', s, *np.shape(s)))
         index = self._arcs.start.searchsorted(inside, 'right') - 1
@@ -255,14 +238,10 @@ class Path:
         """Return the arc length of the nearest point for each of the positions of a drive in order.
 
         Args:
-            positions: Shape (n, 2) or (n, 3) (m).
+            positions: Shape (n, 2) or (n, 3) (m); an entry that is not finite raises ValueError.
             near: Arc length about which the first is searched (m). None: on the whole path.
 
-        Returns:
-            Arc lengths, shape (n) (m), as of `nearest`.
-
-        Raises:
-            ValueError: The shape differs, or an entry is not finite.
+        Returns arc lengths, shape (n) (m), as of `nearest`.
         """
         positions = array('positions', positions, *np.shape(positions))
         result = np.empty(len(positions))
@@ -274,15 +253,9 @@ class Path:
     def errors(pose: Any, reference: Any) -> Errors:
         """Compute the tracking errors of a robot in the frame of a reference.
 
-        Args:
-            pose: `[x, y, theta]` of the robot, shape (..., 3) (m, m, rad).
-            reference: A Reference, or `[x, y, theta]` of the path, shape (..., 3).
-
-        Returns:
-            The errors along and across the path and of the heading, each of shape (...).
-
-        Raises:
-            ValueError: A shape differs, or an entry is not finite.
+        Of `[x, y, theta]` of the robot, shape (..., 3) (m, m, rad), and a Reference, or `[x, y, theta]`
+        of the path, shape (..., 3): the errors along and across the path and of the heading, each of
+        shape (...). A wrong shape and an entry that is not finite raise ValueError.
         """
         placed = se2.compose(se2.inverse(np.asarray(reference)[..., :3]), pose)
         return Errors(*(one[()] for one in np.moveaxis(placed, -1, 0)))

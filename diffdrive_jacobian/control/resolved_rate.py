@@ -111,11 +111,9 @@ def _unlimited(
 class StraightLine:
     """Straight path at constant speed from one point to another, with rest before and after (D, 4.1).
 
-    The coordinates are those of the task: positions, or positions and headings.
-
-    Raises:
-        ValueError: The ends have different or no coordinates, the speed is not positive and finite, or
-            the duration is not a finite number.
+    The coordinates are those of the task: positions, or positions and headings. Ends with different or
+    no coordinates, a speed that is not positive and finite, and a duration that overflows raise
+    ValueError.
     """
 
     start: Any
@@ -153,11 +151,8 @@ class StraightLine:
     def position(self, t: float) -> Array:
         """Return the position at a time, shape (..., m) (m).
 
-        Args:
-            t: Time since the start (s). Before 0 the position is the start, after the duration the end.
-
-        Raises:
-            ValueError: t is not a single finite number.
+        It is the start before t = 0 (s), the end after the duration. A t that is not a single finite
+        number raises ValueError.
         """
         t = number('t', t, finite)
         duration = self._duration[..., np.newaxis]

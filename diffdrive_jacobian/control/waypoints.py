@@ -60,9 +60,8 @@ def heading_error(theta: Number, heading: Number) -> Number:
 class Arrival(Comparable):
     """Arrival criterion. Immutable, comparable and hashable.
 
-    Raises:
-        ValueError: A tolerance is negative or not finite, a velocity is negative or NaN, the offset is
-            not finite, or `use_heading` is not a Boolean.
+    A tolerance that is negative or not finite, a velocity that is negative or NaN, an offset that is not
+    finite, and a `use_heading` that is not a Boolean raise ValueError.
     """
 
     xy_tolerance: NotNegative = 0.02
@@ -81,18 +80,9 @@ class Arrival(Comparable):
     def distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> Any:
         """Compute the distance of the driven point from a goal.
 
-        Args:
-            x: Position of the axle centre, shape (...) (m).
-            y: Likewise.
-            theta: Heading, shape (...) (rad).
-            x_goal: Position of the goal, shape (...) (m).
-            y_goal: Likewise.
-
-        Returns:
-            The distance, shape (...) (m).
-
-        Raises:
-            ValueError: An argument is not finite, shapes do not broadcast, or the distance overflows.
+        Positions x, y (m), headings theta (rad) and positions of the goal (m) have the shape (...), and
+        so has the distance (m). One that is not finite, shapes that do not broadcast, and a distance
+        that overflows raise ValueError.
         """
         return distance_to_goal(x, y, theta, x_goal, y_goal, self.offset)
 
@@ -104,15 +94,9 @@ class Arrival(Comparable):
     def faces(self, theta: Any, heading: Any) -> Any:
         """Return whether the robot has the heading of a goal.
 
-        Args:
-            theta: Heading of the robot, shape (...) (rad).
-            heading: Heading of the goal, shape (...) (rad).
-
-        Returns:
-            Booleans, shape (...).
-
-        Raises:
-            ValueError: An argument is not finite, shapes do not broadcast, or the difference overflows.
+        Headings of the robot, theta, and of the goal have the shape (...) (rad), and so have the
+        Booleans. A heading that is not finite, shapes that do not broadcast, and a difference that
+        overflows raise ValueError.
         """
         return abs(heading_error(theta, heading)) <= self.yaw_tolerance
 
@@ -130,9 +114,8 @@ class Arrival(Comparable):
 class Waypoints:
     """Poses to reach in order, and the progress along them. Immutable.
 
-    Raises:
-        ValueError: The poses have another shape than (n, 3) with n >= 1 or are not finite, there is no
-            pose of that index, or `turning` is not a Boolean.
+    Poses that have another shape than (n, 3) with n >= 1 or are not finite, an index without a pose, and
+    a `turning` that is not a Boolean raise ValueError.
     """
 
     poses: NDArray[np.float64]
@@ -208,13 +191,8 @@ class Waypoints:
     def remaining(self, pose: Pose, arrival: Arrival) -> tuple[float, float]:
         """Return the distance and the turn that are left.
 
-        Args:
-            pose: Pose of the robot, shape (3,).
-            arrival: Arrival criterion.
-
-        Returns:
-            The distance to the last position by way of the waypoints (m), infinite while the robot turns
-            in place; and what is left of that turn (rad), infinite before it.
+        The distance to the last position by way of the waypoints (m) is infinite while the robot turns
+        in place; what is left of that turn (rad) is infinite before it.
         """
         x, y, theta = pose
         if self.turning:

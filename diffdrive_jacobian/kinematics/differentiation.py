@@ -40,12 +40,9 @@ def numerical_jacobian(
         difference: Subtracts two values of r. `inverse_kinematics.pose_difference` is for planar poses,
             whose headings jump at pi.
 
-    Returns:
-        The Jacobians, shape (..., m, n), in the units of r over those of q.
-
-    Raises:
-        ValueError: q has a wrong shape or is not finite, or r returns something else than a finite
-            vector, or vectors of different lengths.
+    Returns the Jacobians, shape (..., m, n), in the units of r over those of q. A q of a wrong shape or
+    that is not finite, and an r that returns something else than finite vectors of one length, raise
+    ValueError.
     """
     q = array('q', q, 'n')
     J_transposed: list[Array] = []

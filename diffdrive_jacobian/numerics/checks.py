@@ -1,4 +1,4 @@
-"""Checks of arguments. Errors name the argument, its value and the values allowed.
+"""Checks of arguments. They raise ValueError with the argument, its value and the values allowed.
 
 Those that need no NumPy are in `fields`.
 """
@@ -48,12 +48,7 @@ ROUNDING = 1e-8
 
 
 def semidefinite(name: str, value: NDArray[np.float64]) -> None:
-    """Require covariance matrices, shape (..., n, n).
-
-    Raises:
-        ValueError: An entry is not finite, or a matrix is not symmetric and positive semidefinite up to
-            rounding.
-    """
+    """Require covariance matrices, shape (..., n, n): symmetric, positive semidefinite up to rounding."""
     finite(name, value)
     transposed = np.swapaxes(value, -1, -2)
     largest = np.abs(value).max(axis=(-2, -1), initial=0.0)
@@ -74,11 +69,7 @@ def anything(name: str, value: Any) -> None:
 
 
 def floats(name: str, value: Any) -> NDArray[np.float64]:
-    """Convert a value to a float array.
-
-    Raises:
-        ValueError: An entry is not a real number, or rows differ in length.
-    """
+    """Convert a value to a float array: real numbers in rows of one length."""
     if type(value) is np.ndarray and value.dtype is FLOAT64:
         return value
     try:
@@ -99,11 +90,7 @@ def floats(name: str, value: Any) -> NDArray[np.float64]:
 
 
 def number(name: str, value: Any, check: Callable[[str, Any], None]) -> float:
-    """Convert a single number to a float, and check it.
-
-    Raises:
-        ValueError: The check fails, or the value is not a single number.
-    """
+    """Convert a single number to a float, and check it."""
     if type(value) is not float:
         if isinstance(value, bool | np.bool_ | str | None):
             raise ValueError(f'{name} must be a number, got {short(value, repr)}')
@@ -124,22 +111,14 @@ Probability = Annotated[float, partial(number, check=between(0.0, 1.0))]
 
 
 def array(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
-    """Convert a value to a finite float array with given last axes. A letter is any length but zero.
-
-    Raises:
-        ValueError: The shape differs, or an entry is infinite, NaN or not a number.
-    """
+    """Convert a value to a finite float array with given last axes. A letter is any length but zero."""
     result = shaped(name, value, *trailing)
     finite(name, result)
     return result
 
 
 def shaped(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
-    """Convert a value to a float array with given last axes. A letter is any length but zero.
-
-    Raises:
-        ValueError: The shape differs, or an entry is not a number.
-    """
+    """Convert a value to a float array with given last axes. A letter is any length but zero."""
     result = floats(name, value)
     if not _ends_with(result.shape, trailing):
         axes = ', '.join(['...', *map(str, trailing)])
@@ -148,11 +127,7 @@ def shaped(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
 
 
 def numbers(name: str, value: Any, size: int) -> list[float]:
-    """Convert a single vector to finite floats.
-
-    Raises:
-        ValueError: The shape is not (size,), or an entry is infinite, NaN or not a number.
-    """
+    """Convert a single vector, shape (size,), to finite floats."""
     result = array(name, value, size)
     if result.ndim != 1:
         raise ValueError(f'{name} must have shape ({size},), got {result.shape}')
@@ -172,11 +147,7 @@ def _ends_with(shape: tuple[int, ...], trailing: tuple[int | str, ...]) -> bool:
 
 
 def nanoseconds(name: str, value: Any) -> int:
-    """Return a time or a duration in nanoseconds as an int.
-
-    Raises:
-        ValueError: The value is not an integer, or does not fit into 64 bits.
-    """
+    """Return a time or a duration in nanoseconds as an int: an integer that fits into 64 bits."""
     if type(value) is not int:
         try:
             if isinstance(value, bool | np.bool_):
@@ -192,20 +163,12 @@ def nanoseconds(name: str, value: Any) -> int:
 
 
 def boolean(name: str, value: Any) -> bool:
-    """Return a Boolean.
-
-    Raises:
-        ValueError: The value is not a Boolean.
-    """
+    """Return a Boolean, also of NumPy."""
     return fields.boolean(name, bool(value) if isinstance(value, np.bool_) else value)
 
 
 def function(name: str, value: Any) -> Any:
-    """Require a callable object.
-
-    Raises:
-        ValueError: The value is not callable.
-    """
+    """Require a callable object."""
     if not callable(value):
         raise ValueError(f'{name} must be a function, got {short(value)}')
     return value
@@ -219,11 +182,7 @@ def read_only(value: Any) -> NDArray[np.float64]:
 
 
 def constant(name: str, value: Any, check: Callable[[str, Any], None]) -> Any:
-    """Convert and check a field of an immutable object. Returns a float, or a read-only array.
-
-    Raises:
-        ValueError: The check fails, or an entry is not a number.
-    """
+    """Convert and check a field of an immutable object. Returns a float, or a read-only array."""
     array = floats(name, value)
     result = read_only(array) if array.ndim else float(array)
     check(name, result)
@@ -252,17 +211,7 @@ class Comparable(fields.Checked):
 
 
 def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
-    """Broadcast the leading axes of arguments.
-
-    Args:
-        shapes: For each argument its shape without the axes of a single robot.
-
-    Returns:
-        Shape of the batch.
-
-    Raises:
-        ValueError: They do not broadcast.
-    """
+    """Broadcast the leading axes of arguments, given the shape of each without the axes of one robot."""
     if not any(shapes.values()):
         return ()
     try:
