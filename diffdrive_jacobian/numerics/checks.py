@@ -48,7 +48,7 @@ ROUNDING = 1e-8
 
 
 def semidefinite(name: str, value: NDArray[np.float64]) -> None:
-    """Require covariance matrices, shape (..., n, n): symmetric, positive semidefinite up to rounding."""
+    """Require covariance matrices, shape (..., n, n): symmetric and positive semidefinite."""
     finite(name, value)
     transposed = np.swapaxes(value, -1, -2)
     largest = np.abs(value).max(axis=(-2, -1), initial=0.0)
