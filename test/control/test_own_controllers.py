@@ -208,12 +208,11 @@ def test_a_broken_controller_is_refused_with_package_and_reason(lockstep, instal
         assert controller.at(0.0, 0.0) == before
 
 
-@pytest.mark.process
-def test_a_broken_controller_ends_the_process_with_one_line(site, install):
+def test_a_broken_controller_ends_the_program_with_one_line(install, capfd):
     install('broken', 'raise RuntimeError("no licence")', package='broken-laws')
-    ended = run(site, 'go_to_goal', '--ros-args', '-p', 'controller:=broken')
-    assert ended.returncode == 2
-    (line,) = ended.stderr.splitlines()
+    arguments = ['--ros-args', '-p', 'controller:=broken']
+    assert run_node('go_to_goal', arguments, Signals()) == 2
+    (line,) = capfd.readouterr().err.splitlines()
     assert "controller 'broken' of broken-laws 1.2" in line
     assert 'cannot be loaded: RuntimeError: no licence' in line
 
@@ -426,7 +425,6 @@ def test_the_example_of_a_test_passes(lockstep, robot_at, monkeypatch):
     modules['test_my_law'].test_my_law_reaches_the_goal(lockstep, robot_at)
 
 
-@pytest.mark.process
 @pytest.mark.pages
 def test_the_example_is_installed(site):
     (declared,) = blocks('toml').values()
@@ -434,8 +432,8 @@ def test_the_example_is_installed(site):
     assert f"{group}': ['{entry.replace(chr(34), '')}']" in PAGE.read_text()
     (site / 'my_law.py').write_text(blocks('python')['my_law'])
     register(site, 'my-laws', '1.0', f'[{group}]\n{entry.replace(chr(34), "")}\n')
-    ended = run(site, 'drive_to', '0.2', '0', '--controller', 'my_law', '--lockstep', '--no-record')
-    assert ended.returncode == 0, ended.stderr
+    arguments = ['0.2', '0', '--controller', 'my_law', '--lockstep', '--no-record']
+    assert drive_to.main(arguments, Signals()) == 0
     assert find_controller('my_law').summary == 'bounded speed'
 
 
