@@ -30,17 +30,8 @@ from diffdrive_jacobian.simulation.closed_loop import Outcomes
 
 ELSEWHERE = {
     *('solve', 'METHODS', 'IKResult', 'track_line', 'remaining', 'resumed', 'all', 'names', 'twist'),
-    *(
-        'wheel_speeds',
-        'reached',
-        'stopped',
-        'Path',
-        'PathController',
-        'PathError',
-        'Reference',
-        'follow_path',
-    ),
-    *('circle_path', 'figure_eight_path', 'line_path', 'planned_path'),
+    *('wheel_speeds', 'reached', 'stopped', 'Path', 'PathController', 'PathError', 'Reference'),
+    *('follow_path', 'circle_path', 'figure_eight_path', 'line_path', 'planned_path'),
     *('Boundary', 'Controller', 'ControllerError', 'Controllers', 'Gain', 'LawError'),
     *('controller_names', 'find_controller', 'KP', 'KV', 'OFFSET', 'CUTOFF', 'FILTER', 'Ellipsoid'),
     *('Sweep', 'SweepSetup', 'describe_sweep', 'sweep', 'sweep_table'),
