@@ -48,13 +48,9 @@ class AnyControllers(Collection[str], Generic[C]):
     """What it is, in the description of the parameter."""
 
     def __init__(self, *given: C) -> None:
-        """Create the collection.
+        """Take further controllers, which take precedence over installed ones of the same name.
 
-        Args:
-            given: Further controllers. They take precedence over installed ones of the same name.
-
-        Raises:
-            ValueError: Something given is of another class, or has the name of a built-in one.
+        One of another class, or with the name of a built-in one, raises ValueError.
         """
         self._given: dict[str, C] = {}
         for controller in given:
@@ -89,8 +85,7 @@ class AnyControllers(Collection[str], Generic[C]):
     def find(self, name: str) -> C:
         """Return the controller of that name; an installed one is imported.
 
-        Raises:
-            ControllerError: There is none, or it cannot be loaded.
+        A name that is unknown, and a controller that cannot be loaded, raise ControllerError.
         """
         if isinstance(name, str) and (found := self._given.get(name) or self.built_in.get(name)):
             assert isinstance(found, self.kind)
@@ -112,11 +107,7 @@ class AnyControllers(Collection[str], Generic[C]):
         return [one for one in found if one.name not in self.built_in]
 
     def _load(self, name: str) -> C:
-        """Import an installed controller.
-
-        Raises:
-            ControllerError: Several packages provide that name, or it cannot be loaded.
-        """
+        """Import an installed controller."""
         known = _loaded.get((self.group, name))
         if isinstance(known, self.kind):
             return known
@@ -173,8 +164,7 @@ ALL_PATH_CONTROLLERS = PathControllers()
 def find_controller(name: str) -> Controller:
     """Return the built-in or installed controller of that name; an installed one is imported.
 
-    Raises:
-        ControllerError: There is none of that name, or it cannot be loaded.
+    A name that is unknown, and a controller that cannot be loaded, raise ControllerError.
     """
     return CONTROLLERS.find(name)
 

@@ -200,9 +200,6 @@ class Path:
                 whole path is searched.
             forward: Whether only what follows the place is searched. So a robot gets past a place where
                 the path turns back.
-
-        Raises:
-            ValueError: An argument is not a finite number.
         """
         x, y = number('x', x, finite), number('y', y, finite)
         low, high = 0.0, self.length

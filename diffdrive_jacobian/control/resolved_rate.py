@@ -60,20 +60,12 @@ def resolved_rate(
         x_dot_desired: Desired velocity, shape (..., m) (m/s).
         gain: K, how fast an error decays, zero or positive, shape (...) (1/s).
         damping: lambda of damped least squares, zero or positive, shape (...), in the units of J.
-        q_dot_0: Secondary joint velocities, projected into the null space of the task (see
-            `inverse_velocity.redundant`), shape (..., n); None: the least ones.
+        q_dot_0: Secondary joint velocities, see `inverse_velocity.redundant`, shape (..., n); None: the
+            least ones.
         max_correction: Largest norm of `K (x_d - x)`, positive, shape (...) (m/s). Without a limit, the
             growing error of a target out of reach would lead to growing joint velocities.
-        weights: Weights of the joints, positive, shape (..., n); None: all 1. A joint with a larger
-            weight moves less.
-        max_velocity: Largest joint speeds, positive, shape (..., n), or one for all joints: all joints
-            are slowed down alike (see `inverse_velocity.limit_velocity`); None: no limits.
-
-    Returns:
-        Joint velocities, shape (..., n).
-
-    Raises:
-        ValueError: The correction or a joint velocity overflows.
+        weights: Weights of the joints, positive, shape (..., n); None: all 1.
+        max_velocity: Largest joint speeds, see `inverse_velocity.limit_velocity`; None: no limits.
     """
     q_dot = _unlimited(J, x, x_desired, x_dot_desired, gain, damping, q_dot_0, max_correction, weights)
     return q_dot if max_velocity is None else limit_velocity(q_dot, max_velocity)

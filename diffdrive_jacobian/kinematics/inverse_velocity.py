@@ -238,8 +238,8 @@ def prioritized(
 ) -> Array:
     """Do tasks in the order of their priority, each as well as those before it allow (C).
 
-    From `q_dot = 0` and `N = I`, for each task: `q_dot += N (J_k N)^+ (x_k_dot - J_k q_dot)`, then
-    `N = N N_k` with the projector `N_k` of `J_k N`. Constraints such as contacts that must not move come
+    From `q_dot = 0` and `N = I`, for each task: `q_dot += N (J_k N)^+ (x_k_dot - J_k q_dot)`, then `N =
+    N N_k` with the projector `N_k` of `J_k N`. Constraints such as contacts that must not move come
     first, with the velocity 0.
 
     Without damping joints move as fast as tasks that nearly conflict demand, up to the cutoff. With the
@@ -262,13 +262,6 @@ def prioritized(
             rounding error.
         weights: Weights of the joints, positive, shape (..., n). None: all 1.
         max_velocity: Largest joint speeds, see `limit_velocity`. None: no limits.
-
-    Returns:
-        Joint velocities, shape (..., n).
-
-    Raises:
-        ValueError: There is no task, a task is not a pair, the numbers of joints differ, shapes do not
-            broadcast, a value is not finite, or the joint velocities overflow.
     """
     cutoff = number('cutoff', cutoff, positive)
     if cutoff >= 1.0:

@@ -83,24 +83,13 @@ def saturate(
     """Scale a twist by the largest factor, at most 1, that meets every limit; `v : omega` is kept.
 
     A direction whose limit is zero is forbidden: its component is set to zero first, because no other
-    factor than 0 would meet the limit. So a robot that may not reverse still turns on the spot.
+    factor than 0 would meet the limit. So a robot that may not reverse still turns on the spot. The
+    result meets every limit exactly, including that of the wheel speeds that `body_to_wheel` returns for
+    it.
 
-    The result meets every limit exactly, including that of the wheel speeds that `body_to_wheel`
-    returns for it.
-
-    Args:
-        v: Forward speed, shape (...) (m/s).
-        omega: Yaw rate, shape (...) (rad/s).
-        limits: The limits.
-        r: Wheel radius, shape (...) (m). Required if the limits have a `max_wheel_speed`.
-        L: Wheel separation, shape (...) (m). Required if the limits have a `max_wheel_speed`.
-
-    Returns:
-        The limited `(v, omega)`, each of shape (...).
-
-    Raises:
-        ValueError: v or omega is not finite; limits are of another class; shapes do not broadcast; the
-            wheels have a limit, and r or L is not positive and finite; the wheel speeds overflow.
+    Speeds v (m/s), yaw rates omega (rad/s), limits, wheel radius r and separation L (m) broadcast to the
+    shape (...) of the results. Only a `max_wheel_speed` needs r and L. Values that are not finite, r or
+    L that is not positive, shapes that do not broadcast, and speeds that overflow raise ValueError.
     """
     instance('limits', limits, VelocityLimits)
     if np.all(limits.max_wheel_speed == np.inf):

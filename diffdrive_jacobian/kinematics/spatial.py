@@ -24,11 +24,7 @@ ROUNDING = 1e-6
 
 
 def _rigid(name: str, T: Array) -> None:
-    """Require homogeneous transforms, shape (..., 4, 4).
-
-    Raises:
-        ValueError: An entry is not finite, R is no rotation matrix, or the last row is not 0, 0, 0, 1.
-    """
+    """Require homogeneous transforms, shape (..., 4, 4)."""
     finite(name, T)
     R = T[..., :3, :3]
     with np.errstate(all='ignore'):

@@ -136,14 +136,11 @@ def numbers(name: str, value: Any, size: int) -> list[float]:
 
 def _ends_with(shape: tuple[int, ...], trailing: tuple[int | str, ...]) -> bool:
     """Return whether the last axes of a shape are those wanted."""
-    if len(shape) != len(trailing):
-        if len(shape) < len(trailing):
-            return False
-        shape = shape[len(shape) - len(trailing) :]
-    for got, wanted in zip(shape, trailing, strict=True):
-        if got != wanted and (type(wanted) is int or got == 0):
-            return False
-    return True
+    last = shape[max(len(shape) - len(trailing), 0) :]
+    return len(last) == len(trailing) and all(
+        got == wanted or (isinstance(wanted, str) and got > 0)
+        for got, wanted in zip(last, trailing, strict=True)
+    )
 
 
 def nanoseconds(name: str, value: Any) -> int:

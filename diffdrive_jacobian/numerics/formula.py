@@ -221,11 +221,7 @@ def entries_last(value: Array, entries: int) -> Array:
 
 
 def _packed(result: Any, core: Shape, batch: tuple[int, ...]) -> Any:
-    """Return a float, or an array with the leading axes of the batch.
-
-    Raises:
-        ValueError: Something is not finite.
-    """
+    """Return a finite float, or an array with the leading axes of the batch, or raise ValueError."""
     if type(result) is float and not batch:
         if math.isfinite(result):
             return result
