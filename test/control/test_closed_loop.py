@@ -132,7 +132,7 @@ def test_neither_order_nor_block_size_matters(monkeypatch, block):
 
     def drive(order, drive=closed_loops):
         rows = starts[order], targets[order], Kp[order], 2.0
-        return drive(go_to_pose, *rows, limits=LIMITS, arrival=arrival, duration=4.0)
+        return drive(go_to_pose, *rows, limits=LIMITS, arrival=arrival, duration=2.0)
 
     expected = drive(np.arange(5))
     monkeypatch.setattr(closed_loop, 'BLOCK', block)
@@ -365,7 +365,7 @@ def test_robots_drive_as_one_of_the_nodes_alone(following, name, stops):
     offset = gains[1] if name == 'offset_point' else 0.0
     arrival = Arrival(use_heading=name == 'pose', offset=offset, **stops)
     actuators = FOLLOWING.get(following)
-    many = {'duration': 5.0, 'arrival': arrival, 'limits': LIMITS, 'actuators': actuators}
+    many = {'duration': 4.0, 'arrival': arrival, 'limits': LIMITS, 'actuators': actuators}
     gone = trajectories(law, starts, targets, *gains, **many)
     assert_same(closed_loops(law, starts, targets, *gains, **many), gone.outcomes)
     model = RobotModel(limits=LIMITS, actuators=actuators)
@@ -382,7 +382,7 @@ def test_robots_drive_as_one_of_the_nodes_alone(following, name, stops):
             robot = robot.commanded(command, robot.stamp).at(robot.stamp + 20 * MS)
         expected = math.nan if arrived is None else arrived
         assert gone.outcomes.time[index] == pytest.approx(expected, nan_ok=True)
-        if arrived is not None and arrived < 3.0:
+        if arrived is not None and arrived < 2.0:
             # What is kept of it ends at rest.
             assert np.abs(robot.twist).max() < 1e-8
     assert gone.outcomes.arrived.any()

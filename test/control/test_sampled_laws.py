@@ -43,7 +43,7 @@ def arrived(monkeypatch):
 def test_robots_arrive_within_the_bound_and_not_beyond(arrived, law, beyond, late):
     # Without delay, with that of a sample, with a random one.
     for delay in (0.0, 1.0, None):
-        assert arrived(law, 1.0, delay, 12).all(), delay
+        assert arrived(law, 1.0, delay, 8).all(), delay
     assert arrived(law, beyond, late, 20).mean() < 0.8
 
 

@@ -102,15 +102,6 @@ def test_the_adjugate_inverts_whatever_the_units_or_raises_an_error(scale):
         np.testing.assert_allclose(inverse, np.linalg.inv(J), rtol=1e-12)
 
 
-def test_what_becomes_of_a_jacobian_does_not_depend_on_its_company():
-    J = np.array([[0.1, 0.2, 0.3], [0.2, 0.4, 0.6 * (1.0 + 1e-12)]])
-    company = np.stack([J, np.zeros((2, 3)), np.full((2, 3), 1e-140), np.full((2, 3), 1e150)])
-    alone = iv.damped_least_squares(J, [1.0, 0.0], [0.0, 0.1])
-    together = iv.damped_least_squares(company[:, np.newaxis], [1.0, 0.0], [0.0, 0.1])
-    assert np.array_equal(together[0], alone)
-    assert iv.manipulability(company)[0] == iv.manipulability(J)
-
-
 def test_the_axle_centre_is_refused_and_so_is_one_of_a_batch_with_its_index():
     theta, r, L = np.random.default_rng(3).uniform(0.01, 3.0, (3, 100))
     for J in [*diff_drive.wheel_to_position_jacobian(theta, r, L), np.zeros((2, 2))]:
