@@ -109,12 +109,8 @@ class IKResult(NamedTuple):
 def pose_difference(target: Vector, pose: Vector) -> Entries:
     """Return the error of planar poses, for `solve(..., difference=pose_difference)`.
 
-    Args:
-        target: `[x, y, heading]` wanted, shape (..., 3) (m, m, rad).
-        pose: `[x, y, heading]` that is, shape (..., 3) (m, m, rad).
-
-    Returns:
-        `target - pose`, shape (..., 3), the heading wrapped to (-pi, pi].
+    Of `[x, y, heading]`, shape (..., 3) (m, m, rad), it is `target - pose`, the heading wrapped to
+    (-pi, pi].
     """
     x, y, heading = target
     x_is, y_is, heading_is = pose
@@ -182,12 +178,8 @@ def solve(
             without limits are drawn from (-pi, pi], those with one limit from 2 pi next to it: give
             limits for joints that are not angles.
 
-    Returns:
-        Joints, whether they converged, after how many steps and restarts, with what error. NumPy's
-        warnings are suppressed.
-
-    Raises:
-        ValueError: An argument has a wrong shape or value, or a function returns a wrong shape.
+    An argument of a wrong shape or value, and a function that returns a wrong shape, raise ValueError.
+    NumPy's warnings are suppressed.
     """
     target, q0 = array('target', target, 'm'), array('q0', q0, 'n')
     (m,), (n,) = target.shape[-1:], q0.shape[-1:]

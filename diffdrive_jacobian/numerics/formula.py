@@ -100,8 +100,7 @@ def formula(signature: str, **checks: Check) -> _Decorator:
         def evaluated(values: list[Any]) -> Any:
             if positional == len(names):
                 return body(*values)
-            by_name = zip(names[positional:], values[positional:], strict=True)
-            return body(*values[:positional], **dict(by_name))
+            return body(**dict(zip(names, values, strict=True)))
 
         @functools.wraps(body)
         def checked(*args: Any, **kwargs: Any) -> Any:
