@@ -1,6 +1,5 @@
 """Control laws that compute velocities from a goal, and controllers by name. No ROS."""
 
-from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import (
     KP,
     KV,
@@ -17,8 +16,7 @@ from diffdrive_jacobian.control.controllers import (
     controller_names,
     find_controller,
 )
-from diffdrive_jacobian.control.go_to_goal import go_to_goal, turn_in_place
-from diffdrive_jacobian.control.offset_point import offset_point
+from diffdrive_jacobian.control.goal_laws import go_to_goal, go_to_pose, offset_point, turn_in_place
 from diffdrive_jacobian.control.path import Path, Reference
 from diffdrive_jacobian.control.path_source import (
     PathError,
@@ -27,9 +25,8 @@ from diffdrive_jacobian.control.path_source import (
     line_path,
     planned_path,
 )
-from diffdrive_jacobian.control.pose import go_to_pose
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
-from diffdrive_jacobian.control.waypoints import Waypoints
+from diffdrive_jacobian.control.waypoints import Arrival, Waypoints
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, saturate
 
 __all__ = [

@@ -28,7 +28,6 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from diffdrive_jacobian.control.path import Reference
-from diffdrive_jacobian.control.sampling import rate_warning
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import (
@@ -60,8 +59,7 @@ class LawError(DiffdriveError, ValueError):
 class Gain(Checked):
     """A gain of a law: a parameter of the node go_to_goal, a slider of the page, an axis of sweeps.
 
-    Raises:
-        ValueError: A field is invalid, or the default is out of range.
+    An invalid field, and a default out of range, raise ValueError.
     """
 
     name: str
@@ -158,11 +156,7 @@ def no_advice(gains: GainValues, limits: VelocityLimits) -> Iterable[str]:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ControlLaw(Checked):
-    """What controllers of goals and of paths have in common.
-
-    Raises:
-        ValueError: A field is invalid.
-    """
+    """What controllers of goals and of paths have in common. An invalid field raises ValueError."""
 
     name: str
     """Name by which it is chosen: a letter, then letters, digits, `_`, `.` or `-`, at most 64."""
@@ -229,10 +223,7 @@ class Controller(ControlLaw):
     """A control law that drives a unicycle to a goal.
 
     The node go_to_goal, sweeps, their pictures and batches of closed loops read this object. Only `name`
-    and `law` are required.
-
-    Raises:
-        ValueError: A field is invalid.
+    and `law` are required. An invalid field raises ValueError.
     """
 
     takes_heading: Annotated[bool, boolean] = False
@@ -261,17 +252,23 @@ class Controller(ControlLaw):
     def rate_warnings(self, gains: GainValues, rate: float, *, turns: bool) -> list[str]:
         """Return the warnings about gains that are too large for the rate of the odometry.
 
-        Args:
-            gains: The gains.
-            rate: Rate of the odometry, at which the law is evaluated (Hz).
-            turns: Whether the robot turns in place at the end, with the gain kp.
+        A law whose yaw rate has the slope K over the heading multiplies an error of the heading by `1 -
+        K / rate` from one sample to the next. So the robot arrives with a slope below twice the rate of
+        the odometry (Hz), and if its commands take effect up to one sample late, below the rate.
+        `turns`: whether the robot turns in place at the end, with the gain kp.
         """
         try:
             slope = 0.0 if self.slope is None else float(self.slope(gains))
-            warning = rate_warning(max(slope, gains.kp if turns else 0.0), rate)
+            slope = max(slope, gains.kp if turns else 0.0)
         except Exception as error:
-            warning = f'the slope of controller {self.name!r} failed: {_reason(error)}'
-        return [warning] if warning else []
+            return [f'the slope of controller {self.name!r} failed: {_reason(error)}']
+        if slope < rate:
+            return []
+        return [
+            f'the law turns by up to {slope:.3g} rad/s per rad of heading, which is not below the '
+            f'odometry rate of {rate:.3g} Hz: if commands take effect up to one sample late, the robot '
+            'may never arrive; choose a smaller kp or kv, or a higher rate'
+        ]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -280,9 +277,6 @@ class PathController(ControlLaw):
 
     A reference is a `path.Reference`, shape (..., 8): where the robot should be, and how it should move
     there. Otherwise the law is as that of a `Controller`.
-
-    Raises:
-        ValueError: A field is invalid.
     """
 
     lookahead: str = ''
@@ -308,8 +302,8 @@ class BoundLaw:
     """A law with its gains, for single poses, and what it remembers.
 
     It is called with a pose, shape (3,), and a goal, shape (3,), or a reference, shape (8,), arrays or
-    tuples of floats, and returns `(v, omega)`. It raises LawError if the law raises an exception or
-    returns something else.
+    tuples of floats, and returns `(v, omega)`. It raises LawError if the law fails or returns something
+    else.
     """
 
     def __init__(self, controller: ControlLaw, values: tuple[float, ...], size: int) -> None:

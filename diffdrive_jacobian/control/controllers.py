@@ -1,23 +1,20 @@
 """Controllers by name: those of this package, and those that other installed packages provide.
 
-The controllers of this package are the objects named `CONTROLLER` in the modules beside this one. Other
-packages provide theirs as entry points of the group `diffdrive_jacobian.controllers`:
+The controllers of this package are those of `goal_laws` and `path_laws`. Other packages provide theirs
+as entry points of the groups `diffdrive_jacobian.controllers` and `diffdrive_jacobian.path_controllers`:
 
     entry_points={'diffdrive_jacobian.controllers': ['my_law = my_package.my_law:CONTROLLER']}
 
-Those of paths are found likewise, in `path_laws` and in the group `diffdrive_jacobian.path_controllers`.
 An entry point is imported when its controller is used, not before.
 """
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from collections.abc import Collection, Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 from diffdrive_jacobian.control.controller import ControlLaw, Controller, PathController
+from diffdrive_jacobian.control.goal_laws import GOAL_CONTROLLERS
 from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.numerics.fields import instance, short
@@ -32,27 +29,12 @@ class ControllerError(DiffdriveError, ValueError):
     """There is no such controller, or it cannot be loaded."""
 
 
-def _built_in() -> dict[str, Controller]:
-    """Return the controllers that are defined in the modules of this package, by name."""
-    found = {}
-    for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
-        if module.name == __name__.rpartition('.')[2]:
-            continue
-        controller = getattr(importlib.import_module(f'{__package__}.{module.name}'), 'CONTROLLER', None)
-        if isinstance(controller, Controller):
-            found[controller.name] = controller
-    return dict(sorted(found.items()))
-
-
-BUILT_IN: dict[str, Controller] = _built_in()
-"""The controllers of this package, by name. Reading it imports nothing."""
+BUILT_IN = {one.name: one for one in GOAL_CONTROLLERS}
+"""The controllers of goals of this package, by name."""
 
 
 class AnyControllers(Collection[str], Generic[C]):
-    """Names of the controllers that can be used, and the controllers by name.
-
-    Iteration and `in` look for installed entry points, but do not import them.
-    """
+    """Base class of `Controllers` and `PathControllers`."""
 
     kind: type[C]
     """Their class."""
@@ -66,13 +48,9 @@ class AnyControllers(Collection[str], Generic[C]):
     """What it is, in the description of the parameter."""
 
     def __init__(self, *given: C) -> None:
-        """Create the collection.
+        """Take further controllers, which take precedence over installed ones of the same name.
 
-        Args:
-            given: Further controllers. They take precedence over installed ones of the same name.
-
-        Raises:
-            ValueError: Something given is of another class, or has the name of a built-in one.
+        One of another class, or with the name of a built-in one, raises ValueError.
         """
         self._given: dict[str, C] = {}
         for controller in given:
@@ -107,8 +85,7 @@ class AnyControllers(Collection[str], Generic[C]):
     def find(self, name: str) -> C:
         """Return the controller of that name; an installed one is imported.
 
-        Raises:
-            ControllerError: There is none, or it cannot be loaded.
+        A name that is unknown, and a controller that cannot be loaded, raise ControllerError.
         """
         if isinstance(name, str) and (found := self._given.get(name) or self.built_in.get(name)):
             assert isinstance(found, self.kind)
@@ -130,11 +107,7 @@ class AnyControllers(Collection[str], Generic[C]):
         return [one for one in found if one.name not in self.built_in]
 
     def _load(self, name: str) -> C:
-        """Import an installed controller.
-
-        Raises:
-            ControllerError: Several packages provide that name, or it cannot be loaded.
-        """
+        """Import an installed controller."""
         known = _loaded.get((self.group, name))
         if isinstance(known, self.kind):
             return known
@@ -173,10 +146,7 @@ class Controllers(AnyControllers[Controller]):
 
 
 class PathControllers(AnyControllers[PathController]):
-    """Names of the controllers of paths that can be used, and the controllers by name.
-
-    Iteration and `in` look for installed entry points, but do not import them.
-    """
+    """Names of the controllers of paths, as `Controllers` of those of goals."""
 
     kind = PathController
     built_in: ClassVar = {one.name: one for one in PATH_CONTROLLERS}
@@ -194,8 +164,7 @@ ALL_PATH_CONTROLLERS = PathControllers()
 def find_controller(name: str) -> Controller:
     """Return the built-in or installed controller of that name; an installed one is imported.
 
-    Raises:
-        ControllerError: There is none of that name, or it cannot be loaded.
+    A name that is unknown, and a controller that cannot be loaded, raise ControllerError.
     """
     return CONTROLLERS.find(name)
 

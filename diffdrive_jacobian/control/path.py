@@ -18,7 +18,7 @@ Source: Bolton 1975, "Biarc curves"; Fritsch and Carlson 1980 for the times.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import cos, floor, sin
+from math import cos, floor, hypot, nan, sin
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,9 +89,8 @@ class _Arcs(NamedTuple):
 class Path:
     """Poses to drive through in order, with times a trajectory. Immutable.
 
-    Raises:
-        ValueError: The poses have another shape than (n, 3) or (n, 2), an entry is not finite, or fewer
-            than two positions differ. The times are not of shape (n), or do not increase.
+    Poses of another shape than (n, 3) or (n, 2) or that are not finite, fewer than two different
+    positions, and times that are not of shape (n) or do not increase raise ValueError.
     """
 
     poses: Floats
@@ -145,10 +144,8 @@ class Path:
     def timed(self, speed: float) -> Path:
         """Return the trajectory along this path with a constant speed (m/s).
 
-        Poses that repeat the position before are left out.
-
-        Raises:
-            ValueError: The speed is not a positive number.
+        Poses that repeat the position before are left out. A speed that is not positive raises
+        ValueError.
         """
         speed = number('speed', speed, positive)
         new = np.concatenate([[True], np.diff(self.arc_lengths) > 0.0])
@@ -157,25 +154,17 @@ class Path:
     def at(self, s: float, speed: float) -> Reference:
         """Return the path at an arc length.
 
-        Args:
-            s: Arc length (m). Before the start of an open path it is the start, after the end the end. A
-                closed path is repeated.
-            speed: Speed along the path, which is constant (m/s).
-
-        Raises:
-            ValueError: An argument is not a finite number.
+        Before the start of an open path s (m) is the start, after the end the end. A closed path is
+        repeated. The speed along the path is constant (m/s). Arguments that are not finite raise
+        ValueError.
         """
         return self._reference(number('s', s, finite), number('speed', speed, finite), 0.0)
 
     def at_time(self, t: float) -> Reference:
         """Return a trajectory at a time: between its poses the speed is continuous.
 
-        Args:
-            t: Time since the first pose (s). Before 0 the robot rests at the first pose, after the
-                duration at the last one.
-
-        Raises:
-            ValueError: t is not a finite number, or the path has no times.
+        Before t = 0 (s) the robot rests at the first pose, after the duration at the last one. A t that
+        is not finite, and a path without times, raise ValueError.
         """
         t = number('t', t, finite)
         if self.times is None:
@@ -187,14 +176,8 @@ class Path:
     def poses_at(self, s: ArrayLike) -> Floats:
         """Return the poses of the path, with the direction of the tangent, at arc lengths as in `at`.
 
-        Args:
-            s: Arc lengths, shape (...) (m).
-
-        Returns:
-            `[x, y, theta]`, shape (..., 3) (m, m, rad).
-
-        Raises:
-            ValueError: An arc length is not finite.
+        Arc lengths s of shape (...) (m) give `[x, y, theta]` of shape (..., 3) (m, m, rad). An arc
+        length that is not finite raises ValueError.
         """
         inside: Floats = self._inside(array('s', s, *np.shape(s)))
         index = self._arcs.start.searchsorted(inside, 'right') - 1
@@ -217,9 +200,6 @@ class Path:
                 whole path is searched.
             forward: Whether only what follows the place is searched. So a robot gets past a place where
                 the path turns back.
-
-        Raises:
-            ValueError: An argument is not a finite number.
         """
         x, y = number('x', x, finite), number('y', y, finite)
         low, high = 0.0, self.length
@@ -255,14 +235,10 @@ class Path:
         """Return the arc length of the nearest point for each of the positions of a drive in order.
 
         Args:
-            positions: Shape (n, 2) or (n, 3) (m).
+            positions: Shape (n, 2) or (n, 3) (m); an entry that is not finite raises ValueError.
             near: Arc length about which the first is searched (m). None: on the whole path.
 
-        Returns:
-            Arc lengths, shape (n) (m), as of `nearest`.
-
-        Raises:
-            ValueError: The shape differs, or an entry is not finite.
+        Returns arc lengths, shape (n) (m), as of `nearest`.
         """
         positions = array('positions', positions, *np.shape(positions))
         result = np.empty(len(positions))
@@ -274,15 +250,9 @@ class Path:
     def errors(pose: Any, reference: Any) -> Errors:
         """Compute the tracking errors of a robot in the frame of a reference.
 
-        Args:
-            pose: `[x, y, theta]` of the robot, shape (..., 3) (m, m, rad).
-            reference: A Reference, or `[x, y, theta]` of the path, shape (..., 3).
-
-        Returns:
-            The errors along and across the path and of the heading, each of shape (...).
-
-        Raises:
-            ValueError: A shape differs, or an entry is not finite.
+        Of `[x, y, theta]` of the robot, shape (..., 3) (m, m, rad), and a Reference, or `[x, y, theta]`
+        of the path, shape (..., 3): the errors along and across the path and of the heading, each of
+        shape (...). A wrong shape and an entry that is not finite raise ValueError.
         """
         placed = se2.compose(se2.inverse(np.asarray(reference)[..., :3]), pose)
         return Errors(*(one[()] for one in np.moveaxis(placed, -1, 0)))
@@ -307,6 +277,33 @@ class Path:
         a_n = curvature * v * v
         ax, ay = v_dot * cos(theta) - a_n * sin(theta), v_dot * sin(theta) + a_n * cos(theta)
         return Reference(x, y, theta, v, curvature * v, ax, ay, s if self.closed else inside)
+
+
+@dataclass(slots=True)
+class PathProgress:
+    """How far a robot is along a path and from it, as seen by somebody who does not drive it."""
+
+    path: Path
+    s: float = 0.0
+    """Arc length of the point nearest to the robot (m)."""
+    across: float = 0.0
+    """Distance from that point, positive to the left of the path (m)."""
+    heading: float = 0.0
+    """Heading of the robot minus that of the path there (rad)."""
+    greatest: float = nan
+    """Greatest absolute distance so far (m); NaN: no pose was taken."""
+
+    def moved(self, pose: Any) -> None:
+        """Take a pose of the robot, `[x, y, theta]` (m, m, rad)."""
+        self.s = self.path.nearest(pose[0], pose[1], self.s)
+        errors = Path.errors(pose, self.path.at(self.s, 0.0))
+        self.across, self.heading = float(errors.across), float(errors.heading)
+        self.greatest = float(np.fmax(self.greatest, abs(self.across)))
+
+    @property
+    def remaining(self) -> float:
+        """Arc length to the end and distance from the path together, as in a right triangle (m)."""
+        return hypot(self.path.length - self.s, self.across)
 
 
 def _times(times: ArrayLike, count: int) -> Floats:

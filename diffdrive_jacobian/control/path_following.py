@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from diffdrive_jacobian.control.controller import BoundLaw
-from diffdrive_jacobian.control.go_to_goal import turn_in_place
+from diffdrive_jacobian.control.goal_laws import turn_in_place
 from diffdrive_jacobian.control.path import Path, Reference
 from diffdrive_jacobian.control.waypoints import Law
 from diffdrive_jacobian.numerics.checks import NotNegative, Positive
@@ -33,11 +33,7 @@ REACH = 4
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PathSettings(Checked):
-    """How a path is followed.
-
-    Raises:
-        ValueError: A value is negative or not finite, or one that must be positive is zero.
-    """
+    """How a path is followed. A field that is out of range raises ValueError."""
 
     speed: NotNegative = 0.2
     """Speed along a path without times (m/s)."""
@@ -81,17 +77,12 @@ class PathFollower:
     ) -> tuple[PathFollower, tuple[Any, Any] | None]:
         """Compute the next command.
 
-        Args:
-            pose: Pose of the robot (m, m, rad).
-            dt: Time since the step before (s).
-            law: The law of the path with its gains. It is reset where another one drives.
-            law_of_goals: The law that drives to goals.
-            how: Speeds and distances.
+        The time since the step before, dt, is in s. The law of the path is reset where another one
+        drives.
 
-        Returns:
-            The follower with the new progress, and the command `(v, omega)` (m/s, rad/s). The command is
-            None at the end, and where a waypoint was missed: then what follows `index` remains, to be
-            driven to as goals.
+        Returns the follower with the new progress, and the command `(v, omega)` (m/s, rad/s). The
+        command is None at the end, and where a waypoint was missed: then what follows `index` remains,
+        to be driven to as goals.
         """
         x, y, theta = pose
         path = self.path

@@ -1,8 +1,10 @@
 """Control laws that drive a unicycle along a path.
 
-State: pose `[x, y, theta]` (m, m, rad). Reference: a `path.Reference`, `[x, y, theta, v, omega, ax, ay,
-s]`, the place on the path that the law drives to, with the speeds and the acceleration there. Output:
-body twist `v, omega` (m/s, rad/s). Everything broadcasts over leading axes, the gains too.
+State: pose `[x, y, theta]`, shape (..., 3) (m, m, rad). Reference: a `path.Reference`, shape (..., 8),
+the place on the path that the law drives to, with the speeds and the acceleration there. Output: body
+twist `(v, omega)`, each of shape (...) (m/s, rad/s). Everything broadcasts over leading axes, the gains
+too. A last axis of a wrong length, values that are not finite or out of their range, shapes that do not
+broadcast, and twists that overflow raise ValueError.
 
 Source: Coulter 1992; Kanayama, Kimura, Miyazaki, Noguchi 1990; document B; Oriolo, De Luca, Vendittelli
 2002; doc/mathematics.md, "Control laws".
@@ -40,19 +42,8 @@ def pure_pursuit(state: Vector, reference: Vector, l_d: Number) -> tuple[Number,
 
     `omega = 2 v y / l_d^2`, where y is the coordinate of the point to the left in the body frame
     (Coulter 1992). The circle is tangent to the heading. A robot that is farther than l_d from the path
-    drives along the circle through the point, too, with its distance in place of l_d.
-
-    Args:
-        state: Pose of the robot, shape (..., 3).
-        reference: The point of the path, shape (..., 8).
-        l_d: Look-ahead distance, positive, shape (...) (m).
-
-    Returns:
-        `(v, omega)`, each of shape (...) (m/s, rad/s).
-
-    Raises:
-        ValueError: l_d is not positive, the last axis of state or reference has a wrong length, shapes
-            do not broadcast, something is not finite, or the twist overflows.
+    drives along the circle through the point, too, with its distance in place of l_d. The look-ahead
+    distance l_d is positive (m).
     """
     x, y, theta = state
     x_r, y_r, _, v_r, *_ = reference
@@ -88,24 +79,10 @@ def kanayama(
 ) -> tuple[Number, Number]:
     """Compute the twist of the tracking control of Kanayama, Kimura, Miyazaki and Noguchi 1990.
 
-    With the errors in the body frame, `e = R(theta)^T (p_r - p)`, `e_theta = wrap(theta_r - theta)`:
-    `v = v_r cos(e_theta) + K_x e_x`, `omega = omega_r + v_r (K_y e_y + K_theta sin(e_theta))`.
-    `V = (e_x^2 + e_y^2)/2 + (1 - cos(e_theta))/K_y` does not grow while v_r >= 0. The errors are
-    critically damped with `K_theta^2 = 4 K_y`.
-
-    Args:
-        state: Pose of the robot, shape (..., 3).
-        reference: The path, shape (..., 8).
-        K_x: Gain on the error ahead, not negative, shape (...) (1/s).
-        K_y: Gain on the error to the left, not negative, shape (...) (1/m^2).
-        K_theta: Gain on the heading error, not negative, shape (...) (1/m).
-
-    Returns:
-        `(v, omega)`, each of shape (...) (m/s, rad/s).
-
-    Raises:
-        ValueError: A gain is negative, the last axis of state or reference has a wrong length, shapes do
-            not broadcast, something is not finite, or the twist overflows.
+    With the errors in the body frame, `e = R(theta)^T (p_r - p)`, `e_theta = wrap(theta_r - theta)`: `v
+    = v_r cos(e_theta) + K_x e_x`, `omega = omega_r + v_r (K_y e_y + K_theta sin(e_theta))`. `V = (e_x^2
+    + e_y^2)/2 + (1 - cos(e_theta))/K_y` does not grow while v_r >= 0. The errors are critically damped
+    with `K_theta^2 = 4 K_y`. No gain is negative: K_x (1/s), K_y (1/m^2), K_theta (1/m).
     """
     x, y, theta = state
     x_r, y_r, theta_r, v_r, omega_r, *_ = reference
@@ -148,21 +125,9 @@ def offset_point_tracking(
     """Compute the twist that lets the offset point track another: `p_d_dot = p_dot_r + k (p_r - p_d)`.
 
     `p_r` is the offset point of a robot that is where the reference is, so that the axle centre, not the
-    offset point, comes to lie on the path. The error of the offset point decays as exp(-k t), whatever
-    the heading. With d > 0 the heading follows along the path.
-
-    Args:
-        state: Pose of the robot, shape (..., 3).
-        reference: The path, shape (..., 8).
-        k: Gain on the distance, shape (...) (1/s).
-        d: X coordinate of the point in the body frame, not 0, shape (...) (m).
-
-    Returns:
-        `(v, omega)`, each of shape (...) (m/s, rad/s).
-
-    Raises:
-        ValueError: d is 0, the last axis of state or reference has a wrong length, shapes do not
-            broadcast, something is not finite, or the twist overflows.
+    offset point, comes to lie on the path. The error of the offset point decays as exp(-k t), with the
+    gain k (1/s), whatever the heading. With d > 0 the heading follows along the path; the x coordinate d
+    of the point in the body frame (m) must not be 0.
     """
     _, _, theta = state
     x_r, y_r, theta_r, v_r, omega_r, *_ = reference
@@ -213,26 +178,15 @@ def dynamic_feedback_linearization(
 
     The speed is a state, `xi = v`: `xi_dot = u_1 cos + u_2 sin`, `omega = (u_2 cos - u_1 sin)/xi`. Then
     `p_ddot = u`, and with `u = p_ddot_r + K_d (p_dot_r - p_dot) + K_p (p_r - p)` the error obeys the
-    linear equation `e_ddot + K_d e_dot + K_p e = 0`. Critically damped with `K_d^2 = 4 K_p`.
+    linear equation `e_ddot + K_d e_dot + K_p e = 0`, with K_p (1/s^2) and K_d (1/s). Critically damped
+    with `K_d^2 = 4 K_p`.
 
     At xi = 0 the law is singular: a robot at rest cannot accelerate sideways. As the paper proposes, xi
     is reset there, to the speed of the reference, but at least to `LEAST_SPEED`: the robot never backs
     up.
 
-    Args:
-        pose: Pose of the robot, shape (..., 3).
-        reference: The path, shape (..., 8).
-        K_p: Gain on the error, shape (...) (1/s^2).
-        K_d: Gain on its derivative, shape (...) (1/s).
-        state: xi, shape (..., 1) (m/s).
-        dt: Time since the call before, shape (...) (s).
-
-    Returns:
-        `(v, omega, state)`, of shapes (...), (...) and (..., 1) (m/s, rad/s, m/s).
-
-    Raises:
-        ValueError: The last axis of an argument has a wrong length, shapes do not broadcast, something
-            is not finite, or the twist overflows.
+    The state is xi, shape (..., 1) (m/s), and dt the time since the call before, shape (...) (s).
+    Returns `(v, omega, state)`.
     """
     x, y, theta = pose
     x_r, y_r, theta_r, v_r, _, ax_r, ay_r, _ = reference

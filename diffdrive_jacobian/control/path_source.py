@@ -49,21 +49,13 @@ class PathError(DiffdriveError, ValueError):
 
 
 def circle_path(radius: float) -> Path:
-    """Return a circle to the left (m).
-
-    Raises:
-        ValueError: The radius is not a positive number.
-    """
+    """Return a circle to the left, of a positive radius (m)."""
     radius = number('radius', radius, positive)
     return _shape(lambda u: (radius * np.sin(u), radius * (1.0 - np.cos(u))), 2.0 * math.pi * radius)
 
 
 def line_path(length: float) -> Path:
-    """Return a straight line (m).
-
-    Raises:
-        ValueError: The length is not a positive number.
-    """
+    """Return a straight line of a positive length (m)."""
     length = number('length', length, positive)
     return _shape(lambda u: (length * u / (2.0 * math.pi), 0.0 * u), length)
 
@@ -71,14 +63,8 @@ def line_path(length: float) -> Path:
 def figure_eight_path(size: float) -> Path:
     """Return a figure eight, the lemniscate of Bernoulli, from one of its ends to the left.
 
-    With `c = a / (1 + sin(u)^2)` it is `x = c sin(u) cos(u), y = a - c cos(u)`. It is 2 a long in y, and
-    narrowest at its ends, with the radius a/3.
-
-    Args:
-        size: Half of its length, a (m).
-
-    Raises:
-        ValueError: The size is not a positive number.
+    With `c = a / (1 + sin(u)^2)` it is `x = c sin(u) cos(u), y = a - c cos(u)`. The size a is positive
+    (m): it is 2 a long in y, and narrowest at its ends, with the radius a/3.
     """
     a = number('size', size, positive)
 
@@ -106,13 +92,11 @@ def is_shape(text: str) -> bool:
 def planned_path(text: str) -> Path:
     """Return the path of a text such as `circle:1.0` or `poses.csv`.
 
-    A file of poses in CSV has their columns: x and y, perhaps theta, and the time t of a trajectory
-    (m, m, rad, s). The first line names them in any order, also as `plot_run --csv` writes them, and
-    other columns are ignored. Without names they are in this order. A YAML file has a list of maps with
-    these names, or of lists in this order, perhaps under the name `poses`.
-
-    Raises:
-        PathError: The text is neither, the file cannot be read, or its poses are no path.
+    A file of poses in CSV has their columns: x and y, perhaps theta, and the time t of a trajectory (m,
+    m, rad, s). The first line names them in any order, also as `plot_run --csv` writes them, and other
+    columns are ignored. Without names they are in this order. A YAML file has a list of maps with these
+    names, or of lists in this order, perhaps under the name `poses`. A text that is neither, a file that
+    cannot be read, and poses that are no path raise PathError.
     """
     shape, _, size = text.partition(':')
     if shape in SHAPES and not size:

@@ -60,20 +60,12 @@ def resolved_rate(
         x_dot_desired: Desired velocity, shape (..., m) (m/s).
         gain: K, how fast an error decays, zero or positive, shape (...) (1/s).
         damping: lambda of damped least squares, zero or positive, shape (...), in the units of J.
-        q_dot_0: Secondary joint velocities, projected into the null space of the task (see
-            `inverse_velocity.redundant`), shape (..., n); None: the least ones.
+        q_dot_0: Secondary joint velocities, see `inverse_velocity.redundant`, shape (..., n); None: the
+            least ones.
         max_correction: Largest norm of `K (x_d - x)`, positive, shape (...) (m/s). Without a limit, the
             growing error of a target out of reach would lead to growing joint velocities.
-        weights: Weights of the joints, positive, shape (..., n); None: all 1. A joint with a larger
-            weight moves less.
-        max_velocity: Largest joint speeds, positive, shape (..., n), or one for all joints: all joints
-            are slowed down alike (see `inverse_velocity.limit_velocity`); None: no limits.
-
-    Returns:
-        Joint velocities, shape (..., n).
-
-    Raises:
-        ValueError: The correction or a joint velocity overflows.
+        weights: Weights of the joints, positive, shape (..., n); None: all 1.
+        max_velocity: Largest joint speeds, see `inverse_velocity.limit_velocity`; None: no limits.
     """
     q_dot = _unlimited(J, x, x_desired, x_dot_desired, gain, damping, q_dot_0, max_correction, weights)
     return q_dot if max_velocity is None else limit_velocity(q_dot, max_velocity)
@@ -111,11 +103,9 @@ def _unlimited(
 class StraightLine:
     """Straight path at constant speed from one point to another, with rest before and after (D, 4.1).
 
-    The coordinates are those of the task: positions, or positions and headings.
-
-    Raises:
-        ValueError: The ends have different or no coordinates, the speed is not positive and finite, or
-            the duration is not a finite number.
+    The coordinates are those of the task: positions, or positions and headings. Ends with different or
+    no coordinates, a speed that is not positive and finite, and a duration that overflows raise
+    ValueError.
     """
 
     start: Any
@@ -153,11 +143,8 @@ class StraightLine:
     def position(self, t: float) -> Array:
         """Return the position at a time, shape (..., m) (m).
 
-        Args:
-            t: Time since the start (s). Before 0 the position is the start, after the duration the end.
-
-        Raises:
-            ValueError: t is not a single finite number.
+        It is the start before t = 0 (s), the end after the duration. A t that is not a single finite
+        number raises ValueError.
         """
         t = number('t', t, finite)
         duration = self._duration[..., np.newaxis]

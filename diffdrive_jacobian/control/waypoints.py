@@ -1,27 +1,38 @@
-"""Waypoints: poses to reach in order. Each step takes the robot's pose and returns the next command."""
+"""Waypoints: poses to reach in order, and when one counts as reached.
+
+Document A's law needs a tolerance, because the heading to the goal is undefined at distance zero. For
+document B's law the distance is measured from the offset point (doc/mathematics.md, "Control laws").
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from functools import partial
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.control.arrival import Arrival, distance_to_goal, heading_error
-from diffdrive_jacobian.control.go_to_goal import turn_in_place
+from diffdrive_jacobian.control.goal_laws import turn_in_place
+from diffdrive_jacobian.kinematics.diff_drive import offset_point
 from diffdrive_jacobian.numerics.checks import (
+    Comparable,
+    NotNegative,
+    NotNegativeOrInfinite,
     array,
     boolean,
+    constant,
     finite,
     function,
     number,
     numbers,
     read_only,
 )
+from diffdrive_jacobian.numerics.elementary import hypot, wrap
 from diffdrive_jacobian.numerics.fields import instance, integer
+from diffdrive_jacobian.numerics.formula import Number, formula
 
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
 STANDSTILL = (0.0, 0.0)
@@ -30,13 +41,81 @@ Law: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
 `(v, omega)`."""
 
 
+@formula('(),(),(),(),(),() -> ()')
+def distance_to_goal(
+    x: Number, y: Number, theta: Number, x_goal: Number, y_goal: Number, offset: Number
+) -> Number:
+    """Compute the distance of the point at x = offset in the body frame from a goal, shape (...) (m)."""
+    x_d, y_d = offset_point.formula((x, y, theta), offset)
+    return hypot(x_goal - x_d, y_goal - y_d)
+
+
+@formula('(),() -> ()')
+def heading_error(theta: Number, heading: Number) -> Number:
+    """Compute the smaller angle from a heading to the desired one, shape (...) (rad)."""
+    return wrap(heading - theta)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Arrival(Comparable):
+    """Arrival criterion. Immutable, comparable and hashable.
+
+    A tolerance that is negative or not finite, a velocity that is negative or NaN, an offset that is not
+    finite, and a `use_heading` that is not a Boolean raise ValueError.
+    """
+
+    xy_tolerance: NotNegative = 0.02
+    """Largest distance to a goal that counts as arrived (m)."""
+    yaw_tolerance: NotNegative = 0.02
+    """Largest heading error at the goal, if the heading counts (rad)."""
+    use_heading: Annotated[bool, boolean] = False
+    """Whether the heading of the last goal counts."""
+    offset: Annotated[Any, partial(constant, check=finite)] = 0.0
+    """X coordinate in the body frame of the point that is to arrive (m), a number or an array."""
+    trans_stopped_velocity: NotNegativeOrInfinite = math.inf
+    """Largest speed with which the last goal counts as reached, as in Nav2's goal checker (m/s)."""
+    rot_stopped_velocity: NotNegativeOrInfinite = math.inf
+    """Largest yaw rate with which it does (rad/s)."""
+
+    def distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> Any:
+        """Compute the distance of the driven point from a goal.
+
+        Positions x, y (m), headings theta (rad) and positions of the goal (m) have the shape (...), and
+        so has the distance (m). One that is not finite, shapes that do not broadcast, and a distance
+        that overflows raise ValueError.
+        """
+        return distance_to_goal(x, y, theta, x_goal, y_goal, self.offset)
+
+    def reached(self, x: float, y: float, theta: float, x_goal: float, y_goal: float) -> bool:
+        """Return whether the distance to a goal is within the tolerance, without checks."""
+        distance = distance_to_goal.formula(x, y, theta, x_goal, y_goal, self.offset)
+        return bool(distance <= self.xy_tolerance)
+
+    def faces(self, theta: Any, heading: Any) -> Any:
+        """Return whether the robot has the heading of a goal.
+
+        Headings of the robot, theta, and of the goal have the shape (...) (rad), and so have the
+        Booleans. A heading that is not finite, shapes that do not broadcast, and a difference that
+        overflows raise ValueError.
+        """
+        return abs(heading_error(theta, heading)) <= self.yaw_tolerance
+
+    @property
+    def must_stop(self) -> bool:
+        """Whether a robot must be slow enough to count as arrived."""
+        return min(self.trans_stopped_velocity, self.rot_stopped_velocity) < math.inf
+
+    def stopped(self, v: Any, omega: Any) -> Any:
+        """Return whether a robot with a twist is slow enough, numbers or arrays; NaN is not."""
+        return (abs(v) <= self.trans_stopped_velocity) & (abs(omega) <= self.rot_stopped_velocity)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Waypoints:
     """Poses to reach in order, and the progress along them. Immutable.
 
-    Raises:
-        ValueError: The poses have another shape than (n, 3) with n >= 1 or are not finite, there is no
-            pose of that index, or `turning` is not a Boolean.
+    Poses that have another shape than (n, 3) with n >= 1 or are not finite, an index without a pose, and
+    a `turning` that is not a Boolean raise ValueError.
     """
 
     poses: NDArray[np.float64]
@@ -112,13 +191,8 @@ class Waypoints:
     def remaining(self, pose: Pose, arrival: Arrival) -> tuple[float, float]:
         """Return the distance and the turn that are left.
 
-        Args:
-            pose: Pose of the robot, shape (3,).
-            arrival: Arrival criterion.
-
-        Returns:
-            The distance to the last position by way of the waypoints (m), infinite while the robot turns
-            in place; and what is left of that turn (rad), infinite before it.
+        The distance to the last position by way of the waypoints (m) is infinite while the robot turns
+        in place; what is left of that turn (rad) is infinite before it.
         """
         x, y, theta = pose
         if self.turning:

@@ -30,16 +30,8 @@ AT_GROUND = pi
 def wheel_contact_position(x: Number, phi: Number, r: Number) -> Entries:
     """Return the position of a point of the rim: `[x + r sin(phi), r + r cos(phi), 0]` (C).
 
-    Args:
-        x: Position of the centre, shape (...) (m).
-        phi: Angle of the point, 0 on top, shape (...) (rad).
-        r: Wheel radius, shape (...) (m).
-
-    Returns:
-        `[along, up, sideways]`, shape (..., 3) (m).
-
-    Raises:
-        ValueError: r is not positive and finite, or x or phi is not finite.
+    For positions x of the centre (m), angles phi of the point, 0 on top (rad), and r (m), each of shape
+    (...), the result is `[along, up, sideways]`, shape (..., 3) (m).
     """
     return [x + r * sin(phi), r + r * cos(phi), 0.0]
 
@@ -48,15 +40,8 @@ def wheel_contact_position(x: Number, phi: Number, r: Number) -> Entries:
 def wheel_contact_jacobian(phi: Number, r: Number) -> Rows:
     """Map `[x_dot, phi_dot]` to the velocity of the point: `[[1, r cos], [0, -r sin], [0, 0]]` (C).
 
-    Args:
-        phi: Angle of the point, 0 on top, shape (...) (rad).
-        r: Wheel radius, shape (...) (m).
-
-    Returns:
-        The Jacobian, shape (..., 3, 2). At phi = pi its null space is the rolling condition.
-
-    Raises:
-        ValueError: r is not positive and finite, or phi is not finite.
+    For angles phi of the point, 0 on top (rad), and r (m), shape (...), it has the shape (..., 3, 2). At
+    phi = pi its null space is the rolling condition.
     """
     return [
         [1.0, r * cos(phi)],
@@ -69,13 +54,7 @@ def wheel_contact_jacobian(phi: Number, r: Number) -> Rows:
 def rolling_direction(r: Number) -> Entries:
     """Return the velocity of a rolling wheel: `[r, 1]` spans the null space at the ground (C).
 
-    Args:
-        r: Wheel radius, shape (...) (m).
-
-    Returns:
-        `[x_dot, phi_dot]` for one radian per second, shape (..., 2) (m/s, rad/s).
-
-    Raises:
-        ValueError: r is not positive and finite.
+    For r (m), shape (...), it is `[x_dot, phi_dot]` for one radian per second, shape (..., 2) (m/s,
+    rad/s).
     """
     return [r, 1.0]

@@ -44,14 +44,8 @@ __all__ = [
 def unicycle_jacobian(theta: Number) -> Rows:
     """Map the body twist to the velocity in the world: `q_dot = S(theta) u` (A(4)-(7)).
 
-    S is the mobile robot's analog of the manipulator's Jacobian J(q), and has no singularities: its
-    columns are orthogonal for every heading.
-
-    Args:
-        theta: Headings, shape (...) (rad).
-
-    Returns:
-        S, shape (..., 3, 2). Its rank is 2 and its singular values are 1, 1 for every heading.
+    S is the mobile robot's analog of the manipulator's Jacobian J(q), and has no singularities: for
+    headings theta (rad), shape (...), its rank is 2 and its singular values are 1, 1. Shape (..., 3, 2).
     """
     return [
         [cos(theta), 0.0],
@@ -64,17 +58,8 @@ def unicycle_jacobian(theta: Number) -> Rows:
 def wheel_to_body_jacobian(r: Number, L: Number) -> Rows:
     """Map wheel speeds to the body twist: `u = J_w w`, `J_w = [[r/2, r/2], [r/L, -r/L]]` (A(8), E).
 
-    A constant of the robot: unlike a manipulator's Jacobian it does not depend on the configuration.
-
-    Args:
-        r: Wheel radius, shape (...) (m).
-        L: Wheel separation, shape (...) (m).
-
-    Returns:
-        J_w, shape (..., 2, 2), over `[omega_R, omega_L]`.
-
-    Raises:
-        ValueError: r or L is not positive and finite.
+    A constant of the robot: unlike a manipulator's Jacobian it does not depend on the configuration. For
+    r and L (m), shape (...), the result over `[omega_R, omega_L]` has the shape (..., 2, 2).
     """
     return [
         [r / 2.0, r / 2.0],
@@ -86,15 +71,7 @@ def wheel_to_body_jacobian(r: Number, L: Number) -> Rows:
 def body_to_wheel_jacobian(r: Number, L: Number) -> Rows:
     """Map the body twist to wheel speeds: `w = J_w^-1 u`, `[[1/r, L/(2r)], [1/r, -L/(2r)]]` (A, E).
 
-    Args:
-        r: Wheel radius, shape (...) (m).
-        L: Wheel separation, shape (...) (m).
-
-    Returns:
-        The inverse of `wheel_to_body_jacobian`, shape (..., 2, 2).
-
-    Raises:
-        ValueError: r or L is not positive and finite.
+    The inverse of `wheel_to_body_jacobian`: for r and L (m), shape (...), it has the shape (..., 2, 2).
     """
     return [
         [1.0 / r, L / (2.0 * r)],
@@ -106,16 +83,7 @@ def body_to_wheel_jacobian(r: Number, L: Number) -> Rows:
 def wheel_to_world_jacobian(theta: Number, r: Number, L: Number) -> Rows:
     """Map wheel speeds to the velocity in the world: the whole chain `q_dot = S(theta) J_w w` (A, B, E).
 
-    Args:
-        theta: Headings, shape (...) (rad).
-        r: Wheel radius, shape (...) (m).
-        L: Wheel separation, shape (...) (m).
-
-    Returns:
-        The product, shape (..., 3, 2), rank 2.
-
-    Raises:
-        ValueError: r or L is not positive and finite.
+    For headings theta (rad), r and L (m), each of shape (...), it has the shape (..., 3, 2) and rank 2.
     """
     S = unicycle_jacobian.formula(theta)
     J_w = wheel_to_body_jacobian.formula(r, L)
@@ -126,15 +94,8 @@ def wheel_to_world_jacobian(theta: Number, r: Number, L: Number) -> Rows:
 def single_wheel_jacobian(theta: Number, r: Number) -> Rows:
     """Map the speed of one driven wheel and the yaw rate to the velocity in the world (B, "Unicycle").
 
-    Args:
-        theta: Headings, shape (...) (rad).
-        r: Wheel radius, shape (...) (m).
-
-    Returns:
-        `[[r cos, 0], [r sin, 0], [0, 1]]`, shape (..., 3, 2), over `[omega_wheel, theta_dot]` (rad/s).
-
-    Raises:
-        ValueError: r is not positive and finite.
+    For headings theta (rad) and r (m), shape (...), it is `[[r cos, 0], [r sin, 0], [0, 1]]`, shape
+    (..., 3, 2), over `[omega_wheel, theta_dot]` (rad/s).
     """
     return [
         [r * cos(theta), 0.0],
@@ -147,20 +108,12 @@ def single_wheel_jacobian(theta: Number, r: Number) -> Rows:
 def wheel_to_position_jacobian(theta: Number, r: Number, L: Number) -> Rows:
     """Map wheel speeds to the velocity of the axle centre alone: `[x_dot, y_dot] = S[:2] J_w w` (B).
 
-    **It has rank 1 for every heading, radius and separation**: the axle centre moves along the
-    heading only, for all wheel speeds. It has no inverse that could control the position. A point off
-    the axle can be controlled, see `offset_point_jacobian`.
+    **It has rank 1 for every heading, radius and separation**: the axle centre moves along the heading
+    only, for all wheel speeds. It has no inverse that could control the position. A point off the axle
+    can be controlled, see `offset_point_jacobian`.
 
-    Args:
-        theta: Headings, shape (...) (rad).
-        r: Wheel radius, shape (...) (m).
-        L: Wheel separation, shape (...) (m).
-
-    Returns:
-        The Jacobian, shape (..., 2, 2), over `[omega_R, omega_L]`. Its determinant is exactly 0.
-
-    Raises:
-        ValueError: r or L is not positive and finite.
+    For headings theta (rad), r and L (m), each of shape (...), the result over `[omega_R, omega_L]` has
+    the shape (..., 2, 2). Its determinant is exactly 0.
     """
     S = unicycle_jacobian.formula(theta)
     J_w = wheel_to_body_jacobian.formula(r, L)
@@ -171,15 +124,8 @@ def wheel_to_position_jacobian(theta: Number, r: Number, L: Number) -> Rows:
 def offset_point(pose: Vector, d: Number) -> Entries:
     """Return the point at x = d in the body frame: `[x + d cos, y + d sin]` in the world (B).
 
-    Args:
-        pose: `[x, y, theta]`, shape (..., 3).
-        d: Coordinate x of the point in the body frame, negative behind the axle, shape (...) (m).
-
-    Returns:
-        The points in the world, shape (..., 2) (m).
-
-    Raises:
-        ValueError: Something is not finite, or shapes do not broadcast.
+    For poses, shape (..., 3), and coordinates d of the point in the body frame, negative behind the
+    axle, shape (...) (m), the result has the shape (..., 2) (m).
     """
     x, y, theta = pose
     return [x + d * cos(theta), y + d * sin(theta)]
@@ -189,20 +135,11 @@ def offset_point(pose: Vector, d: Number) -> Entries:
 def offset_point_jacobian(theta: Number, r: Number, L: Number, d: Number) -> Rows:
     """Map wheel speeds to the velocity of the offset point (B).
 
-    `J_d = R(theta) [[r/2, r/2], [d r/L, -d r/L]]`. Its determinant is `-d r^2 / L`, so it is
-    invertible for every heading if d is not 0.
+    `J_d = R(theta) [[r/2, r/2], [d r/L, -d r/L]]`. Its determinant is `-d r^2 / L`, so it is invertible
+    for every heading if d is not 0: other d raise ValueError.
 
-    Args:
-        theta: Headings, shape (...) (rad).
-        r: Wheel radius, shape (...) (m).
-        L: Wheel separation, shape (...) (m).
-        d: Coordinate x of the point in the body frame, not 0, shape (...) (m).
-
-    Returns:
-        The Jacobian, shape (..., 2, 2), over `[omega_R, omega_L]`.
-
-    Raises:
-        ValueError: r or L is not positive and finite, d is 0 or not finite.
+    For headings theta (rad), r, L and the coordinate x of the point in the body frame, d (m), each of
+    shape (...), the result over `[omega_R, omega_L]` has the shape (..., 2, 2).
     """
     R = [
         [cos(theta), -sin(theta)],
@@ -220,18 +157,8 @@ def offset_point_jacobian(theta: Number, r: Number, L: Number, d: Number) -> Row
 def body_to_wheel(v: Number, omega: Number, r: Number, L: Number) -> tuple[Number, Number]:
     """Return the wheel speeds of a body twist, `J_w^-1 u` in scalar form (A, inverse of (8)).
 
-    Args:
-        v: Forward speed, shape (...) (m/s).
-        omega: Yaw rate, shape (...) (rad/s).
-        r: Wheel radius, shape (...) (m).
-        L: Wheel separation, shape (...) (m).
-
-    Returns:
-        `(omega_R, omega_L)`, each of shape (...) (rad/s).
-
-    Raises:
-        ValueError: r or L is not positive and finite, v or omega is not finite, shapes do not
-            broadcast, or a wheel speed overflows.
+    For v (m/s), omega (rad/s), r and L (m), the result is `(omega_R, omega_L)` (rad/s), each of shape
+    (...).
     """
     omega_R = (v + omega * L / 2.0) / r
     omega_L = (v - omega * L / 2.0) / r
@@ -242,18 +169,8 @@ def body_to_wheel(v: Number, omega: Number, r: Number, L: Number) -> tuple[Numbe
 def wheel_to_body(omega_R: Number, omega_L: Number, r: Number, L: Number) -> tuple[Number, Number]:
     """Return the body twist of wheel speeds, `J_w w` in scalar form (A(8)).
 
-    Args:
-        omega_R: Speed of the right wheel, shape (...) (rad/s).
-        omega_L: Speed of the left wheel, shape (...) (rad/s).
-        r: Wheel radius, shape (...) (m).
-        L: Wheel separation, shape (...) (m).
-
-    Returns:
-        `(v, omega)`, each of shape (...) (m/s, rad/s).
-
-    Raises:
-        ValueError: r or L is not positive and finite, a wheel speed is not finite, shapes do not
-            broadcast, or v or omega overflows.
+    For omega_R and omega_L (rad/s), r and L (m), the result is `(v, omega)` (m/s, rad/s), each of shape
+    (...).
     """
     v = r * (omega_R + omega_L) / 2.0
     omega = r * (omega_R - omega_L) / L
@@ -264,17 +181,9 @@ def wheel_to_body(omega_R: Number, omega_L: Number, r: Number, L: Number) -> tup
 def wheel_centres(pose: Vector, L: Number) -> Rows:
     """Return the positions of the centres of both wheels (E). The middle between them is the pose's.
 
-    They are `L/2` to the right and to the left of it, along `e_l = [sin, -cos]` and against it.
-
-    Args:
-        pose: `[x, y, theta]`, shape (..., 3).
-        L: Wheel separation, shape (...) (m).
-
-    Returns:
-        `[[x_R, y_R], [x_L, y_L]]`, shape (..., 2, 2) (m). Document E has them as `C_2` and `C_1`.
-
-    Raises:
-        ValueError: L is not positive and finite, or the pose is not finite.
+    They are `L/2` to the right and to the left of it, along `e_l = [sin, -cos]` and against it. For
+    poses, shape (..., 3), and L, shape (...) (m), the result is `[[x_R, y_R], [x_L, y_L]]`, shape (...,
+    2, 2) (m). Document E has them as `C_2` and `C_1`.
     """
     x, y, theta = pose
     return [
@@ -287,19 +196,12 @@ def wheel_centres(pose: Vector, L: Number) -> Rows:
 def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
     """Return the velocities of the centres of both wheels, `v_C + theta_dot k × CC_i` (E).
 
-    Their mean is the velocity of the axle centre C. Of wheels that roll without slip they are
-    `r omega_R e_f` and `r omega_L e_f`, along `e_f = [cos, sin]`.
+    Their mean is the velocity of the axle centre C. Of wheels that roll without slip they are `r omega_R
+    e_f` and `r omega_L e_f`, along `e_f = [cos, sin]`.
 
-    Args:
-        theta: Headings, shape (...) (rad).
-        q_dot: `[x_dot, y_dot, theta_dot]` of the robot in the world, shape (..., 3) (m/s, m/s, rad/s).
-        L: Wheel separation, shape (...) (m).
-
-    Returns:
-        Velocities in the world, the right wheel's first, shape (..., 2, 2) (m/s).
-
-    Raises:
-        ValueError: L is not positive and finite, or theta or q_dot is not finite.
+    For headings theta, shape (...) (rad), velocities `q_dot = [x_dot, y_dot, theta_dot]` in the world,
+    shape (..., 3) (m/s, m/s, rad/s), and L, shape (...) (m), the result has the shape (..., 2, 2) (m/s):
+    in the world, the right wheel's first.
     """
     x_dot, y_dot, theta_dot = q_dot
     turning = L / 2.0 * theta_dot
@@ -313,12 +215,8 @@ def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
 def no_lateral_slip_constraint(theta: Number) -> Rows:
     """Return the row `A(q) = [sin, -cos, 0]` with `A(q) q_dot = 0`, no lateral slip (A, E).
 
-    Args:
-        theta: Headings, shape (...) (rad).
-
-    Returns:
-        The constraint, shape (..., 1, 3). Its null space is the range of S(theta). In the body frame
-        it is `[0, -1, 0]` for every heading.
+    For headings theta, shape (...) (rad), the result has the shape (..., 1, 3). Its null space is the
+    range of S(theta). In the body frame it is `[0, -1, 0]` for every heading.
     """
     return [[sin(theta), -cos(theta), 0.0]]
 
@@ -328,14 +226,8 @@ def lie_bracket(theta: Number) -> Entries:
     """Return the Lie bracket of the columns of S(theta): `[g_1, g_2] = [sin, -cos, 0]` (A, 3.2.2).
 
     `[g_1, g_2] = dg_2/dq g_1 - dg_1/dq g_2`. It is the direction that `no_lateral_slip_constraint`
-    forbids. Driving `a` forward, turning by `b`, driving back and turning back moves the robot by
-    `a b [g_1, g_2]`, to second order.
-
-    Args:
-        theta: Headings, shape (...) (rad).
-
-    Returns:
-        The bracket, shape (..., 3).
+    forbids. Driving `a` forward, turning by `b`, driving back and turning back moves the robot by `a b
+    [g_1, g_2]`, to second order. For headings theta, shape (...) (rad), it has the shape (..., 3).
     """
     # dg_2/dq is zero, and dg_1/dq g_2 is the derivative of g_1 = [cos, sin, 0] by theta.
     return [sin(theta), -cos(theta), 0.0]
@@ -345,16 +237,11 @@ def lie_bracket(theta: Number) -> Entries:
 def controllability_matrix(theta: Number) -> Rows:
     """Return the columns `g_1, g_2, [g_1, g_2]`, of which g_1 and g_2 are those of S(theta) (A, 3.2.2).
 
-    Its rank is 3 for every heading, so a unicycle reaches every pose (the Lie algebra rank condition).
+    Its rank is 3 for every heading theta, shape (...) (rad), so a unicycle reaches every pose (the Lie
+    algebra rank condition). Shape (..., 3, 3), determinant 1.
 
     Source: W.-L. Chow, "Über Systeme von linearen partiellen Differentialgleichungen erster Ordnung",
     1939; doc/mathematics.md, "Controllability".
-
-    Args:
-        theta: Headings, shape (...) (rad).
-
-    Returns:
-        The matrix, shape (..., 3, 3). Its determinant is 1.
     """
     S = unicycle_jacobian.formula(theta)
     bracket = lie_bracket.formula(theta)
@@ -366,18 +253,8 @@ def rolling_constraints(theta: Number, r: Number, L: Number) -> tuple[Rows, Rows
     """Return the constraints of two rolling wheels, a pair with `A_q q_dot = A_w w` (E).
 
     Rows: no lateral slip, pure rolling of the right wheel, pure rolling of the left one. `A_q` is
-    invertible, and `A_q^-1 A_w` is the chain `S(theta) J_w`.
-
-    Args:
-        theta: Headings, shape (...) (rad).
-        r: Wheel radius, shape (...) (m).
-        L: Wheel separation, shape (...) (m).
-
-    Returns:
-        `(A_q, A_w)`, shapes (..., 3, 3) and (..., 3, 2).
-
-    Raises:
-        ValueError: r or L is not positive and finite.
+    invertible, and `A_q^-1 A_w` is the chain `S(theta) J_w`. For headings theta (rad), r and L (m), each
+    of shape (...), they have the shapes (..., 3, 3) and (..., 3, 2).
     """
     A_q = [
         [sin(theta), -cos(theta), 0.0],

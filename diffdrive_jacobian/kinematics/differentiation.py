@@ -31,21 +31,13 @@ def numerical_jacobian(
 ) -> Array:
     """Differentiate a function of generalized coordinates: `J_ij = dr_i / dq_j` (C, D).
 
-    The result is accurate to about ten digits where r is smooth. r is called 2 n times for each q, with
-    one q at a time, so it need not broadcast.
+    The result is accurate to about ten digits where r is smooth. r maps coordinates of shape (n,) to a
+    vector of shape (m,). It is called 2 n times for each q, with one q at a time, so it need not
+    broadcast. `difference` subtracts two values of r: `inverse_kinematics.pose_difference` is for planar
+    poses, whose headings jump at pi.
 
-    Args:
-        r: Maps coordinates of shape (n,) to a vector of shape (m,).
-        q: Generalized coordinates, shape (..., n), in any units.
-        difference: Subtracts two values of r. `inverse_kinematics.pose_difference` is for planar poses,
-            whose headings jump at pi.
-
-    Returns:
-        The Jacobians, shape (..., m, n), in the units of r over those of q.
-
-    Raises:
-        ValueError: q has a wrong shape or is not finite, or r returns something else than a finite
-            vector, or vectors of different lengths.
+    For q of shape (..., n), in any units, the Jacobians have the shape (..., m, n), in the units of r
+    over those of q. A q or a value of r that is not finite or of a wrong shape raises ValueError.
     """
     q = array('q', q, 'n')
     J_transposed: list[Array] = []

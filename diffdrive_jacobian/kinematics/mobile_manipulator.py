@@ -37,13 +37,9 @@ def mobile_manipulator_jacobian(
 ) -> Rows:
     """Return the Jacobian of `MobileManipulator` with the heading, over wheels and joints.
 
-    Args:
-        theta: Heading of the base, shape (...) (rad).
-        q: Joint angles, shape (..., n) (rad).
-        lengths: Lengths of the links, shape (n,) (m).
-        mount: Position of the arm's base in the frame of the axle centre, shape (2,) (m).
-        r: Wheel radius (m).
-        L: Wheel separation (m).
+    For headings theta of the base, shape (...) (rad), joint angles q, shape (..., n) (rad), lengths of
+    the links, shape (n,) (m), the position of the arm's base in the frame of the axle centre, shape (2,)
+    (m), and wheel radius r and separation L (m), it has the shape (..., 3, 2 + n).
     """
     R = [
         [cos(theta), -sin(theta)],
@@ -76,8 +72,7 @@ def _mount(name: str, value: Any) -> NDArray[np.float64]:
 class MobileManipulator(Checked):
     """A differential-drive base with a planar arm.
 
-    Raises:
-        ValueError: r or L is not positive and finite, or the mount is not `[m_x, m_y]`.
+    r or L that is not positive and finite, and another mount than `[m_x, m_y]`, raise ValueError.
     """
 
     r: Positive
@@ -92,11 +87,7 @@ class MobileManipulator(Checked):
     def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the pose of the tip in the world.
 
-        Args:
-            q: Configurations, shape (..., 3 + n).
-
-        Returns:
-            `[x, y, heading]`, shape (..., 3) (m, m, rad).
+        For q, shape (..., 3 + n), it is `[x, y, heading]`, shape (..., 3) (m, m, rad).
         """
         return _forward_kinematics(self._checked(q), self.arm.lengths, self.mount)
 
@@ -104,15 +95,9 @@ class MobileManipulator(Checked):
         """Map the velocities of wheels and joints to that of the tip.
 
         `[[I_2 | R'(theta) (m + p_arm)] S(theta) J_w | R(theta) J_arm]`: the wheels move the tip as a
-        part of the base, and the joints move it as the arm does, turned into the world.
-
-        Args:
-            q: Configurations, shape (..., 3 + n).
-            heading: Whether the heading of the tip is a part of the task.
-
-        Returns:
-            The Jacobian, shape (..., 2, 2 + n), or (..., 3, 2 + n) with the heading, over
-            `[omega_R, omega_L, q_1_dot, ...]`.
+        part of the base, and the joints move it as the arm does, turned into the world. For q, shape
+        (..., 3 + n), it has the shape (..., 2, 2 + n), or with the heading of the tip (..., 3, 2 + n),
+        over `[omega_R, omega_L, q_1_dot, ...]`.
         """
         q = self._checked(q)
         J = mobile_manipulator_jacobian(
@@ -123,15 +108,9 @@ class MobileManipulator(Checked):
     def configuration_jacobian(self, q: ArrayLike) -> NDArray[np.float64]:
         """Map the inputs to the velocity of the configuration: `q_dot = G(q) [omega_R, omega_L, ...]`.
 
-        G is `S(theta) J_w` for the pose of the base and the identity for the joints. The gradient of a
-        function of q becomes one over the inputs by `G^T gradient`: with it, secondary tasks such as
-        `manipulability_gradient(robot.jacobian, q)` fit `redundant` (A, 3.2.5).
-
-        Args:
-            q: Configurations, shape (..., 3 + n).
-
-        Returns:
-            G, shape (..., 3 + n, 2 + n).
+        G, shape (..., 3 + n, 2 + n), is `S(theta) J_w` for the pose of the base and the identity for the
+        joints. The gradient of a function of q becomes one over the inputs by `G^T gradient`: with it,
+        secondary tasks such as `manipulability_gradient(robot.jacobian, q)` fit `redundant` (A, 3.2.5).
         """
         theta = self._checked(q)[..., 2]
         G = np.zeros((*theta.shape, 3 + self.arm.joints, 2 + self.arm.joints))
@@ -142,13 +121,8 @@ class MobileManipulator(Checked):
     def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
         """Return the configuration after a time at constant input. The base follows an exact arc.
 
-        Args:
-            q: Configurations at the start, shape (..., 3 + n).
-            q_dot: `[omega_R, omega_L, q_1_dot, ...]`, shape (..., 2 + n) (rad/s).
-            dt: Duration, shape (...) (s).
-
-        Returns:
-            Configurations at the end, shape (..., 3 + n), theta wrapped.
+        For q, shape (..., 3 + n), inputs q_dot, shape (..., 2 + n) (rad/s), and durations, shape (...)
+        (s), it has the shape (..., 3 + n), theta wrapped.
         """
         q_dot = array('q_dot', q_dot, 2 + self.arm.joints)
         return _integrate(self._checked(q), q_dot, dt, self.r, self.L)

@@ -60,12 +60,8 @@ def arm_up_to_nearest_point(lengths: Vector, q: Vector, obstacle: Vector) -> Ent
     """Return the lengths of the links of an arm that ends at its nearest point to an obstacle.
 
     The link with that point is shortened, the links beyond it have the length 0. So the forward
-    kinematics and the Jacobian of this arm are those of the nearest point.
-
-    Args:
-        lengths: Lengths of the links, shape (..., n) (m).
-        q: Joint angles, shape (..., n) (rad).
-        obstacle: A point in the frame of the arm, shape (..., 2) (m).
+    kinematics and the Jacobian of this arm are those of the nearest point. The obstacle is a point in
+    the frame of the arm, shape (..., 2) (m).
     """
     x, y = arm_links(lengths, q)
     nearest: Entries = list(lengths)
@@ -93,8 +89,9 @@ def arm_links(lengths: Vector, q: Vector) -> tuple[list[Number], list[Number]]:
 class PlanarArm:
     """Links in a chain, each joint turning about the z axis.
 
-    Raises:
-        ValueError: There is no link, or a length is not positive and finite.
+    Joint angles q have the shape (..., n) (rad), positions and obstacles are in the frame of the arm
+    (m). A length that is not positive and finite, and a method for two links of an arm that has another
+    number, raise ValueError.
     """
 
     lengths: NDArray[np.float64]
@@ -117,22 +114,14 @@ class PlanarArm:
     def joint_positions(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the positions of the base, of every further joint and of the tip.
 
-        Args:
-            q: Joint angles, shape (..., n) (rad).
-
-        Returns:
-            Positions in the frame of the arm, shape (..., n + 1, 2) (m). The first is the base, [0, 0].
+        The result has the shape (..., n + 1, 2) (m). The first is the base, [0, 0].
         """
         return _joint_positions(self.lengths, q)
 
     def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the pose of the tip (A, D): `x = sum l_i cos(q_1 + ... + q_i)`, y with the sine.
 
-        Args:
-            q: Joint angles, shape (..., n) (rad).
-
-        Returns:
-            `[x, y, heading]`, shape (..., 3) (m, m, rad), the heading wrapped to (-pi, pi].
+        The result is `[x, y, heading]`, shape (..., 3) (m, m, rad), the heading wrapped to (-pi, pi].
         """
         return arm_forward_kinematics(self.lengths, q)
 
@@ -140,14 +129,8 @@ class PlanarArm:
         """Map joint velocities to the velocity of the tip (A, D).
 
         A joint moves the tip at a right angle to the line from the joint to the tip. For two links:
-        `[[-l1 s1 - l2 s12, -l2 s12], [l1 c1 + l2 c12, l2 c12]]`.
-
-        Args:
-            q: Joint angles, shape (..., n) (rad).
-            heading: Whether the heading of the tip is a part of the task.
-
-        Returns:
-            The Jacobian, shape (..., 2, n), or (..., 3, n) with a last row of ones for the heading.
+        `[[-l1 s1 - l2 s12, -l2 s12], [l1 c1 + l2 c12, l2 c12]]`. The result has the shape (..., 2, n),
+        or with the heading of the tip (..., 3, n), with a last row of ones.
         """
         J = arm_jacobian(self.lengths, q)
         if not heading:
@@ -157,14 +140,7 @@ class PlanarArm:
     def determinant(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the determinant of the Jacobian of two links: `l1 l2 sin(q_2)` (A).
 
-        Args:
-            q: Joint angles, shape (..., 2) (rad).
-
-        Returns:
-            The determinant, shape (...) (m^2).
-
-        Raises:
-            ValueError: The arm has not two links.
+        The result has the shape (...) (m^2).
         """
         self._need_two('determinant')
         return np.asarray(_determinant(self.lengths, q))
@@ -173,13 +149,9 @@ class PlanarArm:
         """Return the configurations in which the position is singular: all links on one line (A, D).
 
         There the tip cannot move along that line. Two links are stretched, q_2 = 0, or folded, q_2 = pi.
-
-        Args:
-            q_1: Angle of the first joint, which does not matter, shape (...) (rad).
-
-        Returns:
-            `[q_1, q_2, ..., q_n]` with each of q_2 to q_n 0 or pi, shape (..., 2^(n - 1), n) (rad), the
-            stretched arm first. For two links `[[q_1, 0], [q_1, pi]]`.
+        For angles of the first joint, shape (...) (rad), which do not matter, the result is `[q_1, q_2,
+        ..., q_n]` with each of q_2 to q_n 0 or pi, shape (..., 2^(n - 1), n) (rad), the stretched arm
+        first. For two links `[[q_1, 0], [q_1, pi]]`.
         """
         q_1 = array('q_1', q_1)
         others = list(product((0.0, pi), repeat=self.joints - 1))
@@ -190,22 +162,15 @@ class PlanarArm:
     def inverse_kinematics(self, position: ArrayLike) -> NDArray[np.float64]:
         """Return both explicit solutions of two links: elbow down and elbow up (D, 6).
 
-        `cos(q_2) = (x^2 + y^2 - l_1^2 - l_2^2) / (2 l_1 l_2)` by the law of cosines, and
-        `q_1 = atan2(y, x) - atan2(l_2 sin(q_2), l_1 + l_2 cos(q_2))`. Other arms, and headings, need
+        `cos(q_2) = (x^2 + y^2 - l_1^2 - l_2^2) / (2 l_1 l_2)` by the law of cosines, and `q_1 = atan2(y,
+        x) - atan2(l_2 sin(q_2), l_1 + l_2 cos(q_2))`. Other arms, and headings, need
         `inverse_kinematics.solve`.
 
-        Args:
-            position: Position of the tip, shape (..., 2) (m).
-
-        Returns:
-            `[down, up]`, shape (..., 2, 2) (rad). The first has q_2 from 0 to pi: seen along the line to
-            the tip, the elbow is on the right, below a tip straight ahead. The second has q_2 from -pi
-            to 0. They are the same where the arm is stretched or folded. For a tip on the base, which
-            any q_1 reaches, q_1 is 0.
-
-        Raises:
-            ValueError: The arm has not two links, or a position is out of reach: its distance from the
-                base must be from `|l_1 - l_2|` to `l_1 + l_2`.
+        For positions of the tip, shape (..., 2) (m), the result is `[down, up]`, shape (..., 2, 2)
+        (rad). The first has q_2 from 0 to pi: seen along the line to the tip, the elbow is on the right,
+        below a tip straight ahead. The second has q_2 from -pi to 0. They are the same where the arm is
+        stretched or folded. For a tip on the base, which any q_1 reaches, q_1 is 0. A position out of
+        reach raises ValueError: its distance from the base must be from `|l_1 - l_2|` to `l_1 + l_2`.
         """
         self._need_two('inverse_kinematics')
         position = array('position', position, 2)
@@ -223,16 +188,8 @@ class PlanarArm:
     def inverse_velocity(self, q: ArrayLike, x_dot: ArrayLike) -> NDArray[np.float64]:
         """Return joint velocities of two links for a velocity of the tip, by the adjugate (A, 3.2.1).
 
-        Args:
-            q: Joint angles, shape (..., 2) (rad).
-            x_dot: Velocity of the tip, shape (..., 2) (m/s).
-
-        Returns:
-            Joint velocities, shape (..., 2) (rad/s).
-
-        Raises:
-            LinAlgError: A configuration is singular to working precision.
-            ValueError: The arm has not two links.
+        For velocities of the tip, shape (..., 2) (m/s), the result has the shape (..., 2) (rad/s). A
+        configuration that is singular to working precision raises LinAlgError.
         """
         self._need_two('inverse_velocity')
         return _inverse_velocity(self.lengths, q, x_dot)
@@ -240,12 +197,7 @@ class PlanarArm:
     def clearance(self, q: ArrayLike, obstacle: ArrayLike) -> NDArray[np.float64]:
         """Return the distance of the arm from an obstacle, a point, to the nearest point of its links.
 
-        Args:
-            q: Joint angles, shape (..., n) (rad).
-            obstacle: A point in the frame of the arm, shape (..., 2) (m).
-
-        Returns:
-            The distance, shape (...) (m).
+        Obstacles have the shape (..., 2), the result (...) (m).
         """
         return np.asarray(_clearance(self.lengths, q, obstacle))
 
@@ -253,31 +205,20 @@ class PlanarArm:
         """Return the gradient of `clearance`: a motion away from an obstacle (A, 3.2.5).
 
         It is `J^T n`, with the Jacobian J of the nearest point and the unit vector n from the obstacle
-        to it. Where the nearest point changes to another link, it jumps. As a secondary task:
-        `redundant(J, x_dot, k * arm.clearance_gradient(q, obstacle))`, k > 0.
+        to it, shape (..., n) (m/rad), 0 where the arm touches the obstacle. Where the nearest point
+        changes to another link, it jumps. As a secondary task: `redundant(J, x_dot, k *
+        arm.clearance_gradient(q, obstacle))`, k > 0.
 
         Source: A. A. Maciejewski, C. A. Klein, "Obstacle avoidance for kinematically redundant
         manipulators in dynamically varying environments", 1985.
-
-        Args:
-            q: Joint angles, shape (..., n) (rad).
-            obstacle: A point in the frame of the arm, shape (..., 2) (m).
-
-        Returns:
-            The gradients, shape (..., n) (m/rad). 0 where the arm touches the obstacle.
         """
         return _clearance_gradient(self.lengths, q, obstacle)
 
     def joint_torques(self, q: ArrayLike, wrench: ArrayLike) -> NDArray[np.float64]:
         """Return the joint torques of a wrench at the tip: `tau = J^T W` (D, 6).
 
-        Args:
-            q: Joint angles, shape (..., n) (rad).
-            wrench: Force `[f_x, f_y]` (N), or with the moment `[f_x, f_y, m_z]` (N, N, N m), shape
-                (..., 2) or (..., 3).
-
-        Returns:
-            Torques, shape (..., n) (N m).
+        The wrench is a force `[f_x, f_y]` (N), or with the moment `[f_x, f_y, m_z]` (N, N, N m), shape
+        (..., 2) or (..., 3). The result has the shape (..., n) (N m).
         """
         wrench = array('wrench', wrench, 'm')
         if wrench.shape[-1] not in (2, 3):
@@ -287,13 +228,8 @@ class PlanarArm:
     def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
         """Return the joint angles after a time at constant velocity: `q + q_dot dt` (D, 4.1).
 
-        Args:
-            q: Joint angles at the start, shape (..., n) (rad).
-            q_dot: Joint velocities, shape (..., n) (rad/s).
-            dt: Duration, shape (...) (s).
-
-        Returns:
-            Joint angles at the end, shape (..., n) (rad). They are not wrapped.
+        For joint velocities, shape (..., n) (rad/s), and durations, shape (...) (s), the result has the
+        shape (..., n) (rad). The angles are not wrapped.
         """
         q = array('q', q, self.joints)
         return _integrate(q, q_dot, dt)

@@ -21,16 +21,8 @@ __all__ = ['point_velocity']
 def point_velocity(v: Vector, omega: Vector, offset: Vector) -> Entries:
     """Return the velocity of a point Q of a rigid body: `v_Q = v_P + omega × PQ` (E).
 
-    Args:
-        v: Velocity of the point P of the body, shape (..., 3) (m/s).
-        omega: Angular velocity of the body, shape (..., 3) (rad/s).
-        offset: Vector from P to Q, shape (..., 3) (m).
-
-    Returns:
-        Velocities of Q, shape (..., 3) (m/s).
-
-    Raises:
-        ValueError: Something is not finite, or shapes do not broadcast.
+    For velocities v of the point P (m/s), angular velocities omega of the body (rad/s), and vectors from
+    P to Q, `offset` (m), each of shape (..., 3), the result has the shape (..., 3) (m/s).
     """
     v_x, v_y, v_z = v
     omega_x, omega_y, omega_z = omega

@@ -14,10 +14,9 @@ from typing import Annotated, Any
 import numpy as np
 
 from diffdrive_jacobian.numerics.checks import (
+    Comparable,
     anything,
     constant,
-    equal,
-    hashable,
     leading,
     not_negative_or_infinite,
     not_positive_or_infinite,
@@ -25,7 +24,7 @@ from diffdrive_jacobian.numerics.checks import (
     positive_or_infinite,
 )
 from diffdrive_jacobian.numerics.elementary import maximum, minimum, where
-from diffdrive_jacobian.numerics.fields import Checked, instance
+from diffdrive_jacobian.numerics.fields import instance
 from diffdrive_jacobian.numerics.formula import Number, formula
 
 ROUNDING = 2.0**-49
@@ -33,7 +32,7 @@ ROUNDING = 2.0**-49
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class VelocityLimits(Checked):
+class VelocityLimits(Comparable):
     """Velocity limits of a differential drive; infinity means no limit. Each is a number, or an array
     for several robots that broadcasts with the commands. Immutable, comparable and hashable.
 
@@ -55,18 +54,8 @@ class VelocityLimits(Checked):
 
     def __post_init__(self) -> None:
         """Check every limit."""
-        Checked.__post_init__(self)
+        Comparable.__post_init__(self)
         leading(**{name: np.shape(limit) for name, limit in zip(self.names(), self.all(), strict=True)})
-
-    def __eq__(self, other: object) -> bool:
-        """Compare every limit, arrays by shape and entries."""
-        if not isinstance(other, VelocityLimits):
-            return NotImplemented
-        return all(map(equal, self.all(), other.all()))
-
-    def __hash__(self) -> int:
-        """Return a hash that equal limits share."""
-        return hash(tuple(map(hashable, self.all())))
 
     @property
     def unlimited(self) -> bool:
@@ -94,24 +83,13 @@ def saturate(
     """Scale a twist by the largest factor, at most 1, that meets every limit; `v : omega` is kept.
 
     A direction whose limit is zero is forbidden: its component is set to zero first, because no other
-    factor than 0 would meet the limit. So a robot that may not reverse still turns on the spot.
+    factor than 0 would meet the limit. So a robot that may not reverse still turns on the spot. The
+    result meets every limit exactly, including that of the wheel speeds that `body_to_wheel` returns for
+    it.
 
-    The result meets every limit exactly, including that of the wheel speeds that `body_to_wheel`
-    returns for it.
-
-    Args:
-        v: Forward speed, shape (...) (m/s).
-        omega: Yaw rate, shape (...) (rad/s).
-        limits: The limits.
-        r: Wheel radius, shape (...) (m). Required if the limits have a `max_wheel_speed`.
-        L: Wheel separation, shape (...) (m). Required if the limits have a `max_wheel_speed`.
-
-    Returns:
-        The limited `(v, omega)`, each of shape (...).
-
-    Raises:
-        ValueError: v or omega is not finite; limits are of another class; shapes do not broadcast; the
-            wheels have a limit, and r or L is not positive and finite; the wheel speeds overflow.
+    Speeds v (m/s), yaw rates omega (rad/s), limits, wheel radius r and separation L (m) broadcast to the
+    shape (...) of the results. Only a `max_wheel_speed` needs r and L. Values that are not finite, r or
+    L that is not positive, shapes that do not broadcast, and speeds that overflow raise ValueError.
     """
     instance('limits', limits, VelocityLimits)
     if np.all(limits.max_wheel_speed == np.inf):

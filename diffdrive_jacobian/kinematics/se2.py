@@ -36,17 +36,8 @@ __all__ = [
 def wrap_angle(angle: Number) -> Number:
     """Wrap angles to (-pi, pi].
 
-    The result is exact with respect to the double nearest to 2 pi. An angle in the interval is returned
-    unchanged.
-
-    Args:
-        angle: Angles, any shape (rad).
-
-    Returns:
-        The wrapped angles, same shape (rad).
-
-    Raises:
-        ValueError: An angle is infinite or NaN.
+    Angles have any shape (rad). The result is exact with respect to the double nearest to 2 pi. An angle
+    in the interval is returned unchanged.
     """
     return wrap(angle)
 
@@ -55,14 +46,7 @@ def wrap_angle(angle: Number) -> Number:
 def sinc(angle: Number) -> Number:
     """Compute sin(angle) / angle, which is 1 at zero (not NumPy's sin(pi x) / (pi x)).
 
-    Args:
-        angle: Angles, any shape (rad).
-
-    Returns:
-        The quotients, same shape.
-
-    Raises:
-        ValueError: An angle is infinite or NaN.
+    Angles have any shape (rad).
     """
     return elementary.sinc(angle)
 
@@ -71,13 +55,9 @@ def sinc(angle: Number) -> Number:
 def exp(twist: Vector) -> Entries:
     """Return the pose after motion from the identity with a constant twist for unit time.
 
-    `[V [vx, vy], a]` with the turn a and `V = [[sin(a)/a, (cos(a) - 1)/a], [(1 - cos(a))/a, sin(a)/a]]`.
-
-    Args:
-        twist: `[vx, vy, omega]`, shape (..., 3): velocity in B times time (m, m, rad).
-
-    Returns:
-        The pose reached, shape (..., 3), theta wrapped.
+    `[V [vx, vy], a]` with the turn a and `V = [[sin(a)/a, (cos(a) - 1)/a], [(1 - cos(a))/a, sin(a)/a]]`,
+    for twists `[vx, vy, omega]`, shape (..., 3): velocity in B times time (m, m, rad). The pose, shape
+    (..., 3), has its theta wrapped.
     """
     vx, vy, turn = twist
     # sin(a)/a and (1 - cos(a))/a, of the half angle, so that small turns lose no digits.
@@ -90,11 +70,7 @@ def exp(twist: Vector) -> Entries:
 def log(pose: Vector) -> Entries:
     """Return the twist that reaches a pose from the identity in unit time, the inverse of `exp`.
 
-    Args:
-        pose: `[x, y, theta]`, shape (..., 3).
-
-    Returns:
-        The twist `[vx, vy, omega]`, shape (..., 3), with the turn of least magnitude.
+    For poses, shape (..., 3), it is `[vx, vy, omega]`, shape (..., 3), with the turn of least magnitude.
     """
     x, y, theta = pose
     half = wrap(theta) / 2.0
@@ -106,12 +82,8 @@ def log(pose: Vector) -> Entries:
 def compose(first: Vector, second: Vector) -> Entries:
     """Return the composition of two poses: `second`, given in the frame B of `first`, in the frame W.
 
-    Args:
-        first: Pose of B in W, shape (..., 3).
-        second: Pose of C in B, shape (..., 3).
-
-    Returns:
-        Pose of C in W, shape (..., 3), theta wrapped.
+    For poses of B in W, `first`, and of C in B, `second`, the result is the pose of C in W, each of
+    shape (..., 3), theta wrapped.
     """
     x, y, theta = first
     dx, dy, turn = second
@@ -133,13 +105,8 @@ def inverse(pose: Vector) -> Entries:
 def adjoint(pose: Vector) -> Rows:
     """Return the adjoint of a pose: it maps a twist in B to the same motion as a twist in W.
 
-    `compose(pose, exp(twist)) = compose(exp(adjoint(pose) @ twist), pose)`.
-
-    Args:
-        pose: Pose of B in W, shape (..., 3).
-
-    Returns:
-        Matrices over `[vx, vy, omega]`, shape (..., 3, 3).
+    `compose(pose, exp(twist)) = compose(exp(adjoint(pose) @ twist), pose)`. For poses of B in W, shape
+    (..., 3), it has the shape (..., 3, 3), over `[vx, vy, omega]`.
     """
     x, y, theta = pose
     return [
@@ -153,14 +120,11 @@ def adjoint(pose: Vector) -> Rows:
 def left_jacobian(twist: Vector) -> Rows:
     """Return the left Jacobian of `exp`: `exp(t + d) = compose(exp(J d), exp(t))` to first order in d.
 
+    For twists `[vx, vy, omega]`, shape (..., 3), velocity in B times time (m, m, rad), it has the shape
+    (..., 3, 3).
+
     Source: Barfoot and Furgale, "Associating uncertainty with three-dimensional poses for use in
     estimation problems", 2014, for SE(3); here for SE(2).
-
-    Args:
-        twist: `[vx, vy, omega]`, shape (..., 3): velocity in B times time (m, m, rad).
-
-    Returns:
-        Jacobians J, shape (..., 3, 3).
     """
     vx, vy, turn = twist
     chord = elementary.sinc(turn / 2.0)
@@ -178,7 +142,7 @@ def left_jacobian(twist: Vector) -> Rows:
 def right_jacobian(twist: Vector) -> Rows:
     """Return the right Jacobian of `exp`: `exp(t + d) = compose(exp(t), exp(J d))` to first order in d.
 
-    Arguments and results as for `left_jacobian`, which is this one at the negative twist.
+    It is `left_jacobian` at the negative twist, which see.
     """
     vx, vy, turn = twist
     rows: Rows = left_jacobian.formula([-vx, -vy, -turn])
@@ -189,11 +153,7 @@ def right_jacobian(twist: Vector) -> Rows:
 def homogeneous(pose: Vector) -> Rows:
     """Return the homogeneous transform `H_B^W` of a pose (document B).
 
-    Args:
-        pose: `[x, y, theta]`, shape (..., 3).
-
-    Returns:
-        Transforms, shape (..., 3, 3): they map `[x, y, 1]` in B to W.
+    For poses, shape (..., 3), it has the shape (..., 3, 3) and maps `[x, y, 1]` in B to W.
     """
     x, y, theta = pose
     return [
@@ -207,11 +167,7 @@ def homogeneous(pose: Vector) -> Rows:
 def homogeneous_3d(pose: Vector) -> Rows:
     """Return the homogeneous transform `H_B^W` of a pose in space, where z is up (document B).
 
-    Args:
-        pose: `[x, y, theta]`, shape (..., 3).
-
-    Returns:
-        Transforms, shape (..., 4, 4): they map `[x, y, z, 1]` in B to W.
+    For poses, shape (..., 3), it has the shape (..., 4, 4) and maps `[x, y, z, 1]` in B to W.
     """
     x, y, theta = pose
     return [
@@ -226,18 +182,12 @@ def homogeneous_3d(pose: Vector) -> Rows:
 def integrate(pose: Vector, twist: Vector, dt: Number) -> Entries:
     """Return the pose after a constant twist of a unicycle, the exact arc `q * Exp(u dt)`.
 
+    For poses at the start, shape (..., 3), twists `[v, omega]`, shape (..., 2) (m/s, rad/s), and
+    durations dt, shape (...) (s), negative ones backward in time, the result has the shape (..., 3),
+    theta wrapped. The chord `v dt sin(a/2)/(a/2)` along the heading `theta + a/2`, `a = omega dt`, loses
+    no digits for small turns.
+
     Source: doc/mathematics.md, "Motion".
-
-    The chord `v dt sin(a/2)/(a/2)` along the heading `theta + a/2`, `a = omega dt`, loses no digits
-    for small turns.
-
-    Args:
-        pose: `[x, y, theta]` at the start, shape (..., 3).
-        twist: `[v, omega]` (m/s, rad/s), shape (..., 2).
-        dt: Duration of the twist (s), shape (...). Negative: backward in time.
-
-    Returns:
-        The pose at the end, shape (..., 3), theta wrapped.
     """
     x, y, theta = pose
     v, omega = twist

@@ -40,13 +40,8 @@ class SingularValues(NamedTuple):
     def damped_inverse(self, damping: Any, least: Any = None) -> Array:
         """Return `J^T (J J^T + lambda^2 I)^-1`, which without damping is the pseudo-inverse J^+.
 
-        Args:
-            damping: lambda, shape (...).
-            least: Without damping, singular values up to this count as zero, shape (...). None: see
-                CUTOFF.
-
-        Returns:
-            `sum_i s_i / (s_i^2 + lambda^2) v_i u_i^T`, shape (n, m, ...).
+        It is `sum_i s_i / (s_i^2 + lambda^2) v_i u_i^T`, shape (n, m, ...). Without damping, singular
+        values up to `least` count as zero, by default those of CUTOFF. Both have the shape (...).
         """
         u, s, v = self
         gain = np.where(self._counts(damping, least), s / (s * s + damping * damping), 0.0)
@@ -55,12 +50,7 @@ class SingularValues(NamedTuple):
     def projector(self, damping: Any = 0.0, least: Any = None) -> Array:
         """Return the projector N to the null space, which without damping is `I - J^+ J`.
 
-        Args:
-            damping: lambda, shape (...).
-            least: As that of `damped_inverse`.
-
-        Returns:
-            `I - sum_i f_i v_i v_i^T` with `f_i = min(s_i / (FILTER lambda), 1)`, shape (n, n, ...).
+        It is `I - sum_i f_i v_i v_i^T` with `f_i = min(s_i / (FILTER lambda), 1)`, shape (n, n, ...).
         """
         N: Array = -outer(column(self._removed(damping, least)) * self.v, self.v)
         N[np.diag_indices(len(N))] += 1.0
@@ -85,11 +75,7 @@ class SingularValues(NamedTuple):
 
 
 def svd(J: Array) -> SingularValues:
-    """Return the singular values and vectors of Jacobians, shape (m, n, ...).
-
-    Raises:
-        ValueError: The squares of the entries overflow.
-    """
+    """Return the singular values and vectors of Jacobians, shape (m, n, ...). Squares must be finite."""
     # LAPACK may not terminate with infinite entries.
     finite('|J|^2', 2.0 * np.einsum('ij...,ij...->...', J, J))
     if len(J) == 2:

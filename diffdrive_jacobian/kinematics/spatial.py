@@ -1,8 +1,8 @@
 """The spatial displacement between two poses in space: six numbers, the error of document D.
 
 A pose is a homogeneous transform `[[R, p], [0, 1]]`, shape (4, 4), with the rotation matrix R and the
-position p (m). Everything broadcasts over leading axes. In the plane the same displacement is
-`se2.compose(se2.inverse(pose), target)`.
+position p (m). Everything broadcasts over leading axes. Other matrices raise ValueError. In the plane
+the same displacement is `se2.compose(se2.inverse(pose), target)`.
 
 Source: document D, 6; doc/mathematics.md, "Inverse kinematics".
 """
@@ -24,11 +24,7 @@ ROUNDING = 1e-6
 
 
 def _rigid(name: str, T: Array) -> None:
-    """Require homogeneous transforms, shape (..., 4, 4).
-
-    Raises:
-        ValueError: An entry is not finite, R is no rotation matrix, or the last row is not 0, 0, 0, 1.
-    """
+    """Require homogeneous transforms, shape (..., 4, 4)."""
     finite(name, T)
     R = T[..., :3, :3]
     with np.errstate(all='ignore'):
@@ -46,17 +42,10 @@ def _rigid(name: str, T: Array) -> None:
 def spatial_displacement(T: Any, T_desired: Any) -> Array:
     """Return the displacement from a pose to another one: `Delta = (t, v theta)` (D, 6).
 
-    Args:
-        T: The pose of the end effector E, shape (..., 4, 4).
-        T_desired: Its desired pose, shape (..., 4, 4).
-
-    Returns:
-        `[t_x, t_y, t_z, v_x theta, v_y theta, v_z theta]` in the frame E, shape (..., 6) (m, rad): the
-        translation, and the axis v of the rotation times its angle theta, 0 to pi. At pi the sign of v
-        is one of both.
-
-    Raises:
-        ValueError: An argument is no homogeneous transform.
+    For poses T of the end effector E and desired ones, T_desired, shape (..., 4, 4), the result is
+    `[t_x, t_y, t_z, v_x theta, v_y theta, v_z theta]` in the frame E, shape (..., 6) (m, rad): the
+    translation, and the axis v of the rotation times its angle theta, 0 to pi. At pi the sign of v is
+    one of both.
     """
     R_transposed = transposed(T[:3, :3])
     t = times(R_transposed, T_desired[:3, 3] - T[:3, 3])  # R^T (p_desired - p)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.control import Arrival, Path
-from diffdrive_jacobian.control.path_progress import PathProgress
+from diffdrive_jacobian.control.path import PathProgress
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.messages.goal_follower import (
     UNSTAMPED,

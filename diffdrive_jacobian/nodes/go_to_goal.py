@@ -21,8 +21,8 @@ from std_srvs.srv import Trigger
 from unique_identifier_msgs.msg import UUID
 
 from diffdrive_jacobian.control import KP, KV, Arrival, Controller, Path, PathController, Waypoints
+from diffdrive_jacobian.control.goal_laws import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.control.path_following import PathFollower
-from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import (

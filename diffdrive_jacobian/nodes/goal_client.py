@@ -20,7 +20,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import Arrival, Path
-from diffdrive_jacobian.control.path_progress import PathProgress
+from diffdrive_jacobian.control.path import PathProgress
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import (

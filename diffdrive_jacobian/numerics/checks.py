@@ -1,10 +1,11 @@
-"""Checks of arguments. Errors name the argument, its value and the values allowed.
+"""Checks of arguments. They raise ValueError with the argument, its value and the values allowed.
 
 Those that need no NumPy are in `fields`.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import operator
 from collections.abc import Callable
 from functools import partial
@@ -47,12 +48,7 @@ ROUNDING = 1e-8
 
 
 def semidefinite(name: str, value: NDArray[np.float64]) -> None:
-    """Require covariance matrices, shape (..., n, n).
-
-    Raises:
-        ValueError: An entry is not finite, or a matrix is not symmetric and positive semidefinite up to
-            rounding.
-    """
+    """Require covariance matrices, shape (..., n, n): symmetric and positive semidefinite."""
     finite(name, value)
     transposed = np.swapaxes(value, -1, -2)
     largest = np.abs(value).max(axis=(-2, -1), initial=0.0)
@@ -73,11 +69,7 @@ def anything(name: str, value: Any) -> None:
 
 
 def floats(name: str, value: Any) -> NDArray[np.float64]:
-    """Convert a value to a float array.
-
-    Raises:
-        ValueError: An entry is not a real number, or rows differ in length.
-    """
+    """Convert a value to a float array: real numbers in rows of one length."""
     if type(value) is np.ndarray and value.dtype is FLOAT64:
         return value
     try:
@@ -98,11 +90,7 @@ def floats(name: str, value: Any) -> NDArray[np.float64]:
 
 
 def number(name: str, value: Any, check: Callable[[str, Any], None]) -> float:
-    """Convert a single number to a float, and check it.
-
-    Raises:
-        ValueError: The check fails, or the value is not a single number.
-    """
+    """Convert a single number to a float, and check it."""
     if type(value) is not float:
         if isinstance(value, bool | np.bool_ | str | None):
             raise ValueError(f'{name} must be a number, got {short(value, repr)}')
@@ -123,22 +111,14 @@ Probability = Annotated[float, partial(number, check=between(0.0, 1.0))]
 
 
 def array(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
-    """Convert a value to a finite float array with given last axes. A letter is any length but zero.
-
-    Raises:
-        ValueError: The shape differs, or an entry is infinite, NaN or not a number.
-    """
+    """Convert a value to a finite float array with given last axes. A letter is any length but zero."""
     result = shaped(name, value, *trailing)
     finite(name, result)
     return result
 
 
 def shaped(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
-    """Convert a value to a float array with given last axes. A letter is any length but zero.
-
-    Raises:
-        ValueError: The shape differs, or an entry is not a number.
-    """
+    """Convert a value to a float array with given last axes. A letter is any length but zero."""
     result = floats(name, value)
     if not _ends_with(result.shape, trailing):
         axes = ', '.join(['...', *map(str, trailing)])
@@ -147,11 +127,7 @@ def shaped(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
 
 
 def numbers(name: str, value: Any, size: int) -> list[float]:
-    """Convert a single vector to finite floats.
-
-    Raises:
-        ValueError: The shape is not (size,), or an entry is infinite, NaN or not a number.
-    """
+    """Convert a single vector, shape (size,), to finite floats."""
     result = array(name, value, size)
     if result.ndim != 1:
         raise ValueError(f'{name} must have shape ({size},), got {result.shape}')
@@ -160,22 +136,15 @@ def numbers(name: str, value: Any, size: int) -> list[float]:
 
 def _ends_with(shape: tuple[int, ...], trailing: tuple[int | str, ...]) -> bool:
     """Return whether the last axes of a shape are those wanted."""
-    if len(shape) != len(trailing):
-        if len(shape) < len(trailing):
-            return False
-        shape = shape[len(shape) - len(trailing) :]
-    for got, wanted in zip(shape, trailing, strict=True):
-        if got != wanted and (type(wanted) is int or got == 0):
-            return False
-    return True
+    last = shape[max(len(shape) - len(trailing), 0) :]
+    return len(last) == len(trailing) and all(
+        got == wanted or (isinstance(wanted, str) and got > 0)
+        for got, wanted in zip(last, trailing, strict=True)
+    )
 
 
 def nanoseconds(name: str, value: Any) -> int:
-    """Return a time or a duration in nanoseconds as an int.
-
-    Raises:
-        ValueError: The value is not an integer, or does not fit into 64 bits.
-    """
+    """Return a time or a duration in nanoseconds as an int: an integer that fits into 64 bits."""
     if type(value) is not int:
         try:
             if isinstance(value, bool | np.bool_):
@@ -191,20 +160,12 @@ def nanoseconds(name: str, value: Any) -> int:
 
 
 def boolean(name: str, value: Any) -> bool:
-    """Return a Boolean.
-
-    Raises:
-        ValueError: The value is not a Boolean.
-    """
+    """Return a Boolean, also of NumPy."""
     return fields.boolean(name, bool(value) if isinstance(value, np.bool_) else value)
 
 
 def function(name: str, value: Any) -> Any:
-    """Require a callable object.
-
-    Raises:
-        ValueError: The value is not callable.
-    """
+    """Require a callable object."""
     if not callable(value):
         raise ValueError(f'{name} must be a function, got {short(value)}')
     return value
@@ -218,39 +179,36 @@ def read_only(value: Any) -> NDArray[np.float64]:
 
 
 def constant(name: str, value: Any, check: Callable[[str, Any], None]) -> Any:
-    """Convert and check a field of an immutable object. Returns a float, or a read-only array.
-
-    Raises:
-        ValueError: The check fails, or an entry is not a number.
-    """
+    """Convert and check a field of an immutable object. Returns a float, or a read-only array."""
     array = floats(name, value)
     result = read_only(array) if array.ndim else float(array)
     check(name, result)
     return result
 
 
-def equal(first: Any, second: Any) -> bool:
-    """Return whether numbers or arrays have equal shapes and entries. NaN equals NaN."""
-    return bool(np.array_equal(first, second, equal_nan=True))
+class Comparable(fields.Checked):
+    """Base class of frozen dataclasses whose fields are scalars or arrays, compared by their entries."""
 
+    __slots__ = ()
 
-def hashable(value: Any) -> Any:
-    """Return a hashable object that is equal for equal numbers or arrays."""
-    return value if isinstance(value, float) else (value.shape, *value.ravel().tolist())
+    def __eq__(self, other: object) -> bool:
+        """Compare every field, arrays by shape and entries."""
+        return self._values() == other._values() if type(other) is type(self) else NotImplemented
+
+    def __hash__(self) -> int:
+        """Return a hash that equal values share."""
+        return hash(self._values())
+
+    def _values(self) -> tuple[Any, ...]:
+        values = (getattr(self, field.name) for field in dataclasses.fields(self))  # type: ignore[arg-type]
+        return tuple(
+            (value.shape, *value.ravel().tolist()) if isinstance(value, np.ndarray) else value
+            for value in values
+        )
 
 
 def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
-    """Broadcast the leading axes of arguments.
-
-    Args:
-        shapes: For each argument its shape without the axes of a single robot.
-
-    Returns:
-        Shape of the batch.
-
-    Raises:
-        ValueError: They do not broadcast.
-    """
+    """Broadcast the leading axes of arguments, given the shape of each without the axes of one robot."""
     if not any(shapes.values()):
         return ()
     try:

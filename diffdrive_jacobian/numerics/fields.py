@@ -31,19 +31,15 @@ FEW = 64
 class Checked:
     """Base class of frozen dataclasses whose annotations declare checks.
 
-    Annotations are evaluated when the first value is made. One with a name that exists for type
-    checkers only declares no check. In a dataclass with slots a `__post_init__` calls
+    Annotations are evaluated when the first value is made. One with a name that exists for type checkers
+    only declares no check. In a dataclass with slots a `__post_init__` calls
     `Checked.__post_init__(self)`, because `super()` does not work there.
     """
 
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        """Check and convert the fields, those of base classes first.
-
-        Raises:
-            ValueError: A field is invalid.
-        """
+        """Check and convert the fields, those of base classes first."""
         kind: Any = type(self)
         for name, check in _checks(kind):
             object.__setattr__(self, name, check(name, getattr(self, name)))
@@ -184,11 +180,7 @@ def _bound(value: float) -> str:
 
 
 def positive(name: str, value: Any) -> None:
-    """Require a number or an array to be positive and finite.
-
-    Raises:
-        ValueError: An entry is zero, negative, infinite or NaN.
-    """
+    """Require a number or an array to be positive and finite."""
     # A float needs the first test only. This runs for every message.
     inside = (value > 0.0) & (value < math.inf)
     if inside is not True and not _all(inside):
@@ -196,55 +188,35 @@ def positive(name: str, value: Any) -> None:
 
 
 def positive_or_infinite(name: str, value: Any) -> None:
-    """Require a number or an array to be positive. Infinity means no limit.
-
-    Raises:
-        ValueError: An entry is zero, negative or NaN.
-    """
+    """Require a number or an array to be positive. Infinity means no limit."""
     inside = value > 0.0
     if inside is not True and not _all(inside):
         raise ValueError(f'{name} must be positive, got {value}')
 
 
 def not_negative(name: str, value: Any) -> None:
-    """Require a number or an array to be zero or positive, and finite.
-
-    Raises:
-        ValueError: An entry is negative, infinite or NaN.
-    """
+    """Require a number or an array to be zero or positive, and finite."""
     inside = (value >= 0.0) & (value < math.inf)
     if inside is not True and not _all(inside):
         raise ValueError(f'{name} must be zero or positive and finite, got {_first(value, inside)}')
 
 
 def not_negative_or_infinite(name: str, value: Any) -> None:
-    """Require a number or an array to be zero or positive. Infinity means no limit.
-
-    Raises:
-        ValueError: An entry is negative or NaN.
-    """
+    """Require a number or an array to be zero or positive. Infinity means no limit."""
     inside = value >= 0.0
     if inside is not True and not _all(inside):
         raise ValueError(f'{name} must be zero or positive, got {value}')
 
 
 def not_positive_or_infinite(name: str, value: Any) -> None:
-    """Require a number or an array to be zero or negative. Infinity means no limit.
-
-    Raises:
-        ValueError: An entry is positive or NaN.
-    """
+    """Require a number or an array to be zero or negative. Infinity means no limit."""
     inside = value <= 0.0
     if inside is not True and not _all(inside):
         raise ValueError(f'{name} must be zero or negative, got {value}')
 
 
 def offset(name: str, value: Any) -> None:
-    """Require a control point off the axle: a number or an array.
-
-    Raises:
-        ValueError: An entry is zero, infinite or NaN.
-    """
+    """Require a control point off the axle: a number or an array."""
     inside = (value != 0.0) & (abs(value) < math.inf)
     if inside is not True and not _all(inside):
         raise ValueError(
@@ -254,11 +226,7 @@ def offset(name: str, value: Any) -> None:
 
 
 def finite(name: str, value: Any) -> None:
-    """Require a finite number, or an array of them.
-
-    Raises:
-        ValueError: An entry is infinite or NaN.
-    """
+    """Require a finite number, or an array of them."""
     if type(value) is float:
         if not math.isfinite(value):
             raise ValueError(f'{name} must be finite, got {value}')

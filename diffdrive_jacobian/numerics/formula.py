@@ -100,8 +100,7 @@ def formula(signature: str, **checks: Check) -> _Decorator:
         def evaluated(values: list[Any]) -> Any:
             if positional == len(names):
                 return body(*values)
-            by_name = zip(names[positional:], values[positional:], strict=True)
-            return body(*values[:positional], **dict(by_name))
+            return body(**dict(zip(names, values, strict=True)))
 
         @functools.wraps(body)
         def checked(*args: Any, **kwargs: Any) -> Any:
@@ -221,11 +220,7 @@ def entries_last(value: Array, entries: int) -> Array:
 
 
 def _packed(result: Any, core: Shape, batch: tuple[int, ...]) -> Any:
-    """Return a float, or an array with the leading axes of the batch.
-
-    Raises:
-        ValueError: Something is not finite.
-    """
+    """Return a finite float, or an array with the leading axes of the batch, or raise ValueError."""
     if type(result) is float and not batch:
         if math.isfinite(result):
             return result

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar, cast
 
-from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import (
     KP,
     KV,
@@ -28,6 +27,7 @@ from diffdrive_jacobian.control.controllers import (
 from diffdrive_jacobian.control.controllers import CONTROLLERS as CONTROLLERS
 from diffdrive_jacobian.control.path_following import PathSettings
 from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
+from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
 from diffdrive_jacobian.parameters._fields import (

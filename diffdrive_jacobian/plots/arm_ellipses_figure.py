@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from diffdrive_jacobian.kinematics.manipulability import Ellipsoid
+    from diffdrive_jacobian.kinematics.inverse_velocity import Ellipsoid
     from diffdrive_jacobian.numerics.formula import Array
 
 LENGTHS = (1.0, 1.0)

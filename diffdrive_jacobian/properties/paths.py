@@ -10,7 +10,7 @@ import numpy as np
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.control import Path
-from diffdrive_jacobian.control.path_progress import PathProgress
+from diffdrive_jacobian.control.path import PathProgress
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.codecs import PATH
 from diffdrive_jacobian.messages.conversion import MessageError

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import Controller, Law
-from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
+from diffdrive_jacobian.control.goal_laws import LARGEST_TURN, without_whole_turns
+from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
 from diffdrive_jacobian.numerics.checks import array, floats, function, leading, number, positive
 from diffdrive_jacobian.numerics.elementary import wrap

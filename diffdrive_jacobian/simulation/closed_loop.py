@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import Controller, Law
+from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import function
 from diffdrive_jacobian.simulation._block import Array, Batch, Block, Keep, Outcomes, Rows

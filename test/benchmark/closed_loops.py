@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from peers import PEERS
 from table import Goal, Row, interleave
 
-from diffdrive_jacobian.control.go_to_goal import go_to_goal
+from diffdrive_jacobian.control.goal_laws import go_to_goal
 from diffdrive_jacobian.simulation.closed_loop import closed_loops
 
 Array = NDArray[np.float64]

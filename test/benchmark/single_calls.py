@@ -56,7 +56,7 @@ class Call(NamedTuple):
     def check(self) -> None:
         """Refuse to compare speeds of ways to different results."""
         ours, other = self.ours(), self.by_hand()
-        tolerance = 1e-5 if self.name in (SOLVER, 'manipulability.manipulability_gradient') else 1e-9
+        tolerance = 1e-5 if self.name in (SOLVER, 'inverse_velocity.manipulability_gradient') else 1e-9
         for mine, theirs in zip(_parts(ours), _parts(other), strict=True):
             if not np.allclose(mine, theirs, rtol=tolerance, atol=tolerance):
                 raise RuntimeError(f'{self.name}: different results, {ours} and {other}')
@@ -197,12 +197,12 @@ def calls() -> list[Call]:
             partial(by_hand.resolved_rate, *rate),
         ),
         Call(
-            'task_priority.prioritized',
+            'inverse_velocity.prioritized',
             partial(iv.prioritized, pair[:1]),
             lambda: np.linalg.pinv(WIDE) @ X_DOT,
         ),
         Call(
-            'manipulability.manipulability_gradient',
+            'inverse_velocity.manipulability_gradient',
             partial(iv.manipulability_gradient, ARM.jacobian, Q),
             lambda: by_hand.gradient(
                 lambda q: by_hand.manipulability(by_hand.two_links(ARM.lengths, q)), Q

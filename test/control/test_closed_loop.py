@@ -131,7 +131,7 @@ def test_neither_order_nor_block_size_matters(monkeypatch, block):
 
     def drive(order, drive=closed_loops):
         rows = starts[order], targets[order], Kp[order], 2.0
-        return drive(go_to_pose, *rows, limits=LIMITS, arrival=arrival, duration=4.0)
+        return drive(go_to_pose, *rows, limits=LIMITS, arrival=arrival, duration=2.0)
 
     expected = drive(np.arange(5))
     monkeypatch.setattr(closed_loop, 'BLOCK', block)
@@ -310,36 +310,17 @@ def test_a_law_that_returns_something_else_is_named():
             closed_loops(lambda *_, twist=twist: twist, np.zeros((2, 3)), [1.0, 0.0], limits=limits)
 
 
-BAD = {
-    'starts': [np.zeros(2), 0.0, [0.0, 0.0, np.nan], 'here'],
-    'goals': [[1.0], [1.0] * 4, 1.0, [np.inf, 0.0], np.zeros((3, 2))],
-    'gain 1': [np.nan, np.ones(3), 'much'],
-    'rate': [0.0, -1.0, np.nan, np.inf, 'x', None],
-    'duration': [0.0, -1.0, np.nan, np.inf, 'x', None],
-    'turning_gain': [np.nan, np.ones(3), 'a'],
-    'r': [0.0, -1.0, [0.1, np.nan], np.ones(3)],
-    'L': [0.0, np.inf, [0.1, -0.1], np.ones(3)],
-    'max_v': [np.ones(3)],
-    'offset': [np.ones(3)],
-}
-
-
-@pytest.mark.parametrize('drive', [closed_loops, trajectories])
-@pytest.mark.parametrize('name', BAD)
-def test_invalid_arguments_are_named(drive, name):
-    for bad in BAD[name]:
-        batch = {'starts': np.zeros((2, 3)), 'goals': [1.0, 0.0], 'gain 1': 0.5}
-        options = {}
-        if name in batch:
-            batch[name] = bad
-        elif name == 'max_v':
-            options['limits'] = VelocityLimits(max_v=bad)
-        elif name == 'offset':
-            options['arrival'] = Arrival(offset=bad)
-        else:
-            options[name] = bad
-        with pytest.raises(ValueError, match=rf'\b{name}\b.* must .*got'):
-            drive(go_to_goal, batch['starts'], batch['goals'], 3.0, batch['gain 1'], **options)
+def test_invalid_gains_and_shapes_of_options_are_named():
+    """The other arguments are in kinematics/test_arguments.py."""
+    batch = np.zeros((2, 3)), [1.0, 0.0], 3.0
+    for name, gain, options in (
+        *(('gain 1', bad, {}) for bad in (np.nan, np.ones(3), 'much')),
+        ('max_v', 0.5, {'limits': VelocityLimits(max_v=np.ones(3))}),
+        ('offset', 0.5, {'arrival': Arrival(offset=np.ones(3))}),
+    ):
+        for drive in (closed_loops, trajectories):
+            with pytest.raises(ValueError, match=rf'\b{name}\b.* must .*got'):
+                drive(go_to_goal, *batch, gain, **options)
 
 
 def test_headings_that_count_must_be_given():
@@ -362,7 +343,6 @@ MS = 1_000_000
 FOLLOWING = {
     'limits': Actuators(acceleration=SLOW),
     'wheels': Actuators(acceleration=AccelerationLimits(max_wheel_acceleration=60.0), delay=40 * MS),
-    'lag': Actuators(lag=0.08),
     'all': Actuators(acceleration=SLOW, lag=0.02, delay=33 * MS),
 }
 AT_REST = {'trans_stopped_velocity': 0.01, 'rot_stopped_velocity': 0.05}
@@ -372,10 +352,8 @@ AT_REST = {'trans_stopped_velocity': 0.01, 'rot_stopped_velocity': 0.05}
     ('following', 'name', 'stops'),
     [
         (None, 'pose', {}),
-        ('limits', 'go_to_goal', {}),
         ('limits', 'pose', AT_REST),
         ('wheels', 'offset_point', AT_REST),
-        ('lag', 'pose', {}),
         ('all', 'go_to_goal', AT_REST),
         ('all', 'offset_point', {}),
     ],
@@ -386,7 +364,7 @@ def test_robots_drive_as_one_of_the_nodes_alone(following, name, stops):
     offset = gains[1] if name == 'offset_point' else 0.0
     arrival = Arrival(use_heading=name == 'pose', offset=offset, **stops)
     actuators = FOLLOWING.get(following)
-    many = {'duration': 5.0, 'arrival': arrival, 'limits': LIMITS, 'actuators': actuators}
+    many = {'duration': 4.0, 'arrival': arrival, 'limits': LIMITS, 'actuators': actuators}
     gone = trajectories(law, starts, targets, *gains, **many)
     assert_same(closed_loops(law, starts, targets, *gains, **many), gone.outcomes)
     model = RobotModel(limits=LIMITS, actuators=actuators)
@@ -403,7 +381,7 @@ def test_robots_drive_as_one_of_the_nodes_alone(following, name, stops):
             robot = robot.commanded(command, robot.stamp).at(robot.stamp + 20 * MS)
         expected = math.nan if arrived is None else arrived
         assert gone.outcomes.time[index] == pytest.approx(expected, nan_ok=True)
-        if arrived is not None and arrived < 3.0:
+        if arrived is not None and arrived < 2.0:
             # What is kept of it ends at rest.
             assert np.abs(robot.twist).max() < 1e-8
     assert gone.outcomes.arrived.any()

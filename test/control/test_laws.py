@@ -25,7 +25,6 @@ from diffdrive_jacobian.simulation import closed_loops
 KP, KV = 3.0, 0.5  # document A's gains
 COUNT = 2_000
 LAWS = {'go_to_goal': go_to_goal, 'offset_point': offset_point, 'pose': go_to_pose}
-GAINS = {'go_to_goal': ['Kp', 'Kv'], 'offset_point': ['k', 'd'], 'pose': ['Kp', 'Kv', 'h']}
 HEADING_COUNTS = Arrival(use_heading=True)
 
 
@@ -67,24 +66,6 @@ def point(poses, d):
 
 
 @pytest.mark.parametrize('name', LAWS)
-def test_states_goals_and_gains_broadcast(name):
-    law, (states, targets) = LAWS[name], random_poses(1, 4)
-    gains = random_gains(2, 4, len(GAINS[name]))
-    goals = goals_of(name, targets)
-    grid = law(states[:3, np.newaxis], goals, gains[0, :3, np.newaxis], *gains[1:])
-    assert [part.shape for part in grid] == [(3, 4)] * 2
-    for i, j in np.ndindex(3, 4):
-        one = law(states[i], goals[j], gains[0, i], *gains[1:, j])
-        assert_allclose([part[i, j] for part in grid], one, rtol=1e-12, atol=1e-14)
-        assert type(one[0]) is type(one[1]) is float
-    # One argument alone may have the axes.
-    for many in range(len(gains)):
-        values = [1.0] * len(gains)
-        values[many] = np.ones((2, 1))
-        assert [part.shape for part in law(np.zeros((7, 3)), goals[0], *values)] == [(2, 7)] * 2
-
-
-@pytest.mark.parametrize('name', LAWS)
 def test_moved_to_another_place_or_mirrored_a_law_is_the_same(name):
     law, (states, targets), motions = LAWS[name], random_poses(3), random_poses(4)[0]
 
@@ -104,36 +85,6 @@ def test_a_law_and_its_unchecked_equation_agree(name):
     law, (states, targets) = BUILT_IN[name].law, random_poses(5, 50)
     goals, gains = goals_of(name, targets), random_gains(6, 50)
     np.testing.assert_array_equal(law.formula(states.T, goals.T, *gains), law(states, goals, *gains))
-
-
-BAD_GAINS = {
-    'go_to_goal': [math.nan, math.inf],
-    'offset_point': [math.nan, math.inf],
-    'pose': [math.nan, math.inf, 0.0, -1.0, [1.0, -2.0]],
-}
-
-
-@pytest.mark.parametrize('name', LAWS)
-def test_invalid_arguments_are_named(name):
-    good = {'state': np.zeros((2, 3)), 'goal': np.ones(3 if name == 'pose' else 2)}
-    good |= dict.fromkeys(GAINS[name], 0.5)
-    size = len(good['goal'])
-    bad = {
-        'state': [np.zeros(2), np.zeros(4), (0.5,), 0.0, [[0.0, 0.0, np.nan]], 'here'],
-        'goal': [np.zeros(5 - size), (0.5,), np.full(size, -np.inf), np.zeros((3, size))],
-        **{gain: [*BAD_GAINS[name], np.ones(3), 'much', 1j] for gain in GAINS[name]},
-    }
-    if name == 'offset_point':
-        # The axle centre itself can only be driven ahead.
-        bad['d'] += [0.0, -0.0, [0.1, 0.0], np.zeros((2, 2))]
-    for argument, values in bad.items():
-        for value in values:
-            with pytest.raises(ValueError, match=rf'\b{argument}\b.* must ') as caught:
-                LAWS[name](**{**good, argument: value})
-            assert 'got' in str(caught.value), (argument, value)
-    if name == 'offset_point':
-        with pytest.raises(ValueError, match=r'^d must be .*not 0.* rank 1.*got 0'):
-            offset_point(np.zeros(3), [1.0, 1.0], 1.0, 0.0)
 
 
 # --- Document A
@@ -173,6 +124,12 @@ def test_go_to_goal_arrives_from_every_start():
 
 
 # --- Document B: the offset point goes straight to its goal, like exp(-k t)
+
+
+def test_the_axle_centre_cannot_be_driven_as_the_offset_point():
+    for d in (0.0, -0.0, [0.1, 0.0]):
+        with pytest.raises(ValueError, match=r'^d must be .*not 0.* rank 1.*got -?0'):
+            offset_point(np.zeros(3), [1.0, 1.0], 1.0, d)
 
 
 def random_offsets(seed, count=COUNT):
@@ -288,7 +245,7 @@ def test_the_lyapunov_function_never_grows_along_the_polar_equations():
 
 @pytest.mark.parametrize('case', ['free', 'limited', 'forwards', 'near'])
 def test_poses_are_taken_from_everywhere(case):
-    states, targets = random_poses(28, 400, {'near': 0.05, 'limited': 1.5}.get(case, 3.0))
+    states, targets = random_poses(28, 200, {'near': 0.05, 'limited': 1.5}.get(case, 3.0))
     gains, limits = (KP, KV), VelocityLimits()
     if case == 'limited':
         # Under limits the paths are shorter: several of them take long all the same.
@@ -296,13 +253,12 @@ def test_poses_are_taken_from_everywhere(case):
         states, targets = states[:100], targets[:100]
     if case == 'forwards':
         # A robot that may not back up, whatever the gains.
-        states, targets = states[:200], targets[:200]
         gains, limits = (np.repeat([6.0, 12.0, 24.0, 45.0], 50), 0.5), VelocityLimits(min_v=0.0)
     if case == 'near':
         # With headings beside pi, exactly behind, and with other gains.
         states[::2, 2], targets[::3, 2] = np.pi, -np.pi
         states[::5, :2], targets[::7, :2] = [0.3, 0.0], 0.0
-        Kv, ratio = np.random.default_rng(29).uniform([[0.3], [1.0]], [[2.0], [10.0]], (2, 400))
+        Kv, ratio = np.random.default_rng(29).uniform([[0.3], [1.0]], [[2.0], [10.0]], (2, 200))
         gains = Kv * ratio, Kv
     how = {'arrival': HEADING_COUNTS, 'limits': limits, 'duration': 90.0}
     found = closed_loops(go_to_pose, states, targets, *gains, **how)

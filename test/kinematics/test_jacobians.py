@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import itertools
 import pkgutil
 
 import numpy as np
@@ -23,6 +24,19 @@ from diffdrive_jacobian.kinematics.planar_arm import PlanarArm, arm_forward_kine
 COUNT = 200
 STEP = 1e-5
 MOUNTS = [(0.0, 0.0), (0.12, -0.07)]
+CASES = []
+"""Name of a derivative, function that returns it and its numeric value, and options of the function."""
+
+
+def derivative(name, **options):
+    """Let a function be a case of the test below, with each combination of its options."""
+
+    def register(case):
+        for chosen in itertools.product(*options.values()):
+            CASES.append((name, case, dict(zip(options, chosen, strict=True))))
+        return case
+
+    return register
 
 
 def differences(function, at=None, step=STEP):
@@ -56,41 +70,48 @@ class Robots:
         return se2.log(moved)[..., ::2]
 
 
+@derivative('diff_drive.unicycle_jacobian')
 def unicycle(rng):
     robots = Robots(rng)
     numeric = differences(lambda u: robots.steered(u[..., 0], u[..., 1]))
     return diff_drive.unicycle_jacobian(robots.theta), numeric
 
 
+@derivative('diff_drive.wheel_to_body_jacobian')
 def wheel_to_body(rng):
     robots = Robots(rng)
     return diff_drive.wheel_to_body_jacobian(robots.r, robots.L), differences(robots.twist)
 
 
+@derivative('diff_drive.body_to_wheel_jacobian')
 def body_to_wheel(rng):
     robots = Robots(rng)
     numeric = np.linalg.inv(differences(robots.twist))
     return diff_drive.body_to_wheel_jacobian(robots.r, robots.L), numeric
 
 
+@derivative('diff_drive.wheel_to_world_jacobian')
 def wheel_to_world(rng):
     robots = Robots(rng)
     jacobian = diff_drive.wheel_to_world_jacobian(robots.theta, robots.r, robots.L)
     return jacobian, differences(robots.rolled)
 
 
+@derivative('diff_drive.wheel_to_position_jacobian')
 def wheel_to_position(rng):
     robots = Robots(rng)
     jacobian = diff_drive.wheel_to_position_jacobian(robots.theta, robots.r, robots.L)
     return jacobian, differences(lambda angles: robots.rolled(angles)[..., :2])
 
 
+@derivative('diff_drive.single_wheel_jacobian')
 def single_wheel(rng):
     robots = Robots(rng)
     numeric = differences(lambda u: robots.steered(robots.r[:, np.newaxis] * u[..., 0], u[..., 1]))
     return diff_drive.single_wheel_jacobian(robots.theta, robots.r), numeric
 
 
+@derivative('diff_drive.offset_point_jacobian')
 def offset_point(rng):
     robots = Robots(rng)
     jacobian = diff_drive.offset_point_jacobian(robots.theta, robots.r, robots.L, robots.d)
@@ -98,6 +119,7 @@ def offset_point(rng):
     return jacobian, point
 
 
+@derivative('contact.wheel_contact_jacobian')
 def wheel_contact(rng):
     r, q = 10.0 ** rng.uniform(-2.0, 0.0, COUNT), rng.uniform(-4.0, 4.0, (COUNT, 2))
 
@@ -107,24 +129,38 @@ def wheel_contact(rng):
     return contact.wheel_contact_jacobian(q[:, 1], r), differences(point, q)
 
 
-def exponential(rng, side):
+@derivative('se2.left_jacobian')
+def left(rng):
     t = rng.uniform(-4.0, 4.0, (COUNT, 3))
-    here = se2.inverse(se2.exp(t))[:, np.newaxis]
+    back = se2.inverse(se2.exp(t))[:, np.newaxis]
 
     def change(d):
-        there = se2.exp(t[:, np.newaxis] + d)
-        return se2.log(se2.compose(there, here) if side == 'left' else se2.compose(here, there))
+        return se2.log(se2.compose(se2.exp(t[:, np.newaxis] + d), back))
 
-    jacobian = se2.left_jacobian(t) if side == 'left' else se2.right_jacobian(t)
-    return jacobian, differences(change, np.zeros((COUNT, 3)))
+    return se2.left_jacobian(t), differences(change, np.zeros((COUNT, 3)))
 
 
+@derivative('se2.right_jacobian')
+def right(rng):
+    t = rng.uniform(-4.0, 4.0, (COUNT, 3))
+    back = se2.inverse(se2.exp(t))[:, np.newaxis]
+
+    def change(d):
+        return se2.log(se2.compose(back, se2.exp(t[:, np.newaxis] + d)))
+
+    return se2.right_jacobian(t), differences(change, np.zeros((COUNT, 3)))
+
+
+@derivative('planar_arm.PlanarArm.jacobian', links=(1, 2, 5), heading=(False, True))
 def planar_arm(rng, links, heading):
     arm, q = PlanarArm(rng.uniform(0.1, 1.0, links)), rng.uniform(-4.0, 4.0, (COUNT, links))
     numeric = differences(lambda q: arm.forward_kinematics(q)[..., : 3 if heading else 2], q)
     return arm.jacobian(q, heading=heading), numeric
 
 
+@derivative(
+    'mobile_manipulator.MobileManipulator.jacobian', links=(1, 3), heading=(False, True), mount=MOUNTS
+)
 def mobile_manipulator(rng, links, heading, mount):
     arm = PlanarArm(rng.uniform(0.1, 1.0, links))
     robot = MobileManipulator(r=0.05, L=0.3, arm=arm, mount=mount)
@@ -137,18 +173,21 @@ def mobile_manipulator(rng, links, heading, mount):
     return robot.jacobian(q, heading=heading), differences(tip, np.zeros((COUNT, 2 + links)))
 
 
+@derivative('differentiation.numerical_jacobian', links=[3])
 def any_function(rng, links):
     arm, q = PlanarArm(rng.uniform(0.1, 1.0, links)), rng.uniform(-4.0, 4.0, (COUNT, links))
     numeric = numerical_jacobian(arm.forward_kinematics, q, difference=pose_difference)
     return numeric, arm.jacobian(q, heading=True)
 
 
+@derivative('planar_arm.arm_jacobian', links=[3])
 def arm_of_lengths(rng, links):
     lengths, q = rng.uniform(0.1, 1.0, links), rng.uniform(-4.0, 4.0, (COUNT, links))
     numeric = differences(lambda q: arm_forward_kinematics(lengths, q)[..., :2], q)
     return arm_jacobian(lengths, q), numeric
 
 
+@derivative('mobile_manipulator.mobile_manipulator_jacobian', links=[2])
 def manipulator_of_lengths(rng, links):
     lengths, mount = rng.uniform(0.1, 1.0, links), MOUNTS[1]
     robot = MobileManipulator(r=0.05, L=0.3, arm=PlanarArm(lengths), mount=mount)
@@ -161,6 +200,7 @@ def manipulator_of_lengths(rng, links):
     return jacobian, differences(tip, np.zeros((COUNT, 2 + links)))
 
 
+@derivative('mobile_manipulator.MobileManipulator.configuration_jacobian', links=(1, 3))
 def configuration(rng, links):
     arm = PlanarArm(rng.uniform(0.1, 1.0, links))
     robot, q = MobileManipulator(r=0.05, L=0.3, arm=arm), rng.uniform(-3.0, 3.0, (COUNT, 3 + links))
@@ -171,6 +211,8 @@ def configuration(rng, links):
     return robot.configuration_jacobian(q), differences(moved, np.zeros((COUNT, 2 + links)))
 
 
+@derivative('inverse_velocity.manipulability_gradient', links=(2, 3), heading=[False])
+@derivative('inverse_velocity.manipulability_gradient', links=[4], heading=[True])
 def manipulability(rng, links, heading):
     arm, q = PlanarArm(rng.uniform(0.3, 1.0, links)), rng.uniform(-4.0, 4.0, (COUNT, links))
     if links == 2:  # The measure has an edge where the arm is singular.
@@ -187,6 +229,7 @@ def manipulability(rng, links, heading):
     return iv.manipulability_gradient(jacobian, q)[:, np.newaxis], numeric
 
 
+@derivative('inverse_velocity.joint_limit_gradient')
 def joint_limit(rng):
     q, lower = rng.uniform(-4.0, 4.0, (2, COUNT, 5))
     upper = lower + rng.uniform(0.1, 6.0, (COUNT, 5))
@@ -195,6 +238,7 @@ def joint_limit(rng):
     return iv.joint_limit_gradient(q, lower, upper)[:, np.newaxis], numeric
 
 
+@derivative('planar_arm.PlanarArm.clearance_gradient', links=[3])
 def clearance(rng, links):
     # Not folded, and obstacles beside elbows and tip: no joint moves the base.
     arm, q = PlanarArm(rng.uniform(0.3, 1.0, links)), rng.uniform(-0.8, 0.8, (COUNT, links))
@@ -202,51 +246,6 @@ def clearance(rng, links):
     obstacle = arm.joint_positions(q)[range(COUNT), rng.integers(1, links + 1, COUNT)] + beside
     numeric = differences(lambda q: arm.clearance(q, obstacle[:, np.newaxis])[..., np.newaxis], q)
     return arm.clearance_gradient(q, obstacle)[:, np.newaxis], numeric
-
-
-CASES = [
-    ('diff_drive.unicycle_jacobian', unicycle, {}),
-    ('diff_drive.wheel_to_body_jacobian', wheel_to_body, {}),
-    ('diff_drive.body_to_wheel_jacobian', body_to_wheel, {}),
-    ('diff_drive.wheel_to_world_jacobian', wheel_to_world, {}),
-    ('diff_drive.wheel_to_position_jacobian', wheel_to_position, {}),
-    ('diff_drive.single_wheel_jacobian', single_wheel, {}),
-    ('diff_drive.offset_point_jacobian', offset_point, {}),
-    ('contact.wheel_contact_jacobian', wheel_contact, {}),
-    ('se2.left_jacobian', exponential, {'side': 'left'}),
-    ('se2.right_jacobian', exponential, {'side': 'right'}),
-    *(
-        ('planar_arm.PlanarArm.jacobian', planar_arm, {'links': links, 'heading': heading})
-        for links in (1, 2, 5)
-        for heading in (False, True)
-    ),
-    *(
-        (
-            'mobile_manipulator.MobileManipulator.jacobian',
-            mobile_manipulator,
-            {'links': links, 'heading': heading, 'mount': mount},
-        )
-        for links in (1, 3)
-        for heading in (False, True)
-        for mount in MOUNTS
-    ),
-    ('differentiation.numerical_jacobian', any_function, {'links': 3}),
-    ('planar_arm.arm_jacobian', arm_of_lengths, {'links': 3}),
-    ('mobile_manipulator.mobile_manipulator_jacobian', manipulator_of_lengths, {'links': 2}),
-    *(
-        (
-            'mobile_manipulator.MobileManipulator.configuration_jacobian',
-            configuration,
-            {'links': links},
-        )
-        for links in (1, 3)
-    ),
-    ('manipulability.manipulability_gradient', manipulability, {'links': 2, 'heading': False}),
-    ('manipulability.manipulability_gradient', manipulability, {'links': 3, 'heading': False}),
-    ('manipulability.manipulability_gradient', manipulability, {'links': 4, 'heading': True}),
-    ('joint_limits.joint_limit_gradient', joint_limit, {}),
-    ('planar_arm.PlanarArm.clearance_gradient', clearance, {'links': 3}),
-]
 
 
 @pytest.mark.parametrize(
@@ -265,13 +264,9 @@ def test_only_functions_from_vectors_to_vectors_are_differentiated(r, q, message
         numerical_jacobian(r, q)
 
 
-def label(name, options):
-    return ' '.join([name, *(f'{option}={chosen}' for option, chosen in options.items())])
-
-
 @pytest.mark.parametrize(
     ('case', 'options'),
-    [pytest.param(case, options, id=label(name, options)) for name, case, options in CASES],
+    [pytest.param(case, options, id=f'{name} {options}') for name, case, options in CASES],
 )
 def test_it_is_the_derivative_of_the_motion(case, options):
     jacobian, numeric = case(np.random.default_rng(1), **options)

@@ -57,7 +57,7 @@ def test_a_weighted_jacobian_that_overflows_raises_an_error(rows):
                 call(J)
 
 
-@pytest.mark.parametrize('scale', [1e-140, 1e-100, 1e100, 1e150, 1e153, 1e155, 1e200, 1e307])
+@pytest.mark.parametrize('scale', [1e-140, 1e150, 1e155, 1e307])
 @pytest.mark.parametrize('rows', [1, 2, 3])
 def test_jacobians_of_any_size_are_inverted_or_refused(rows, scale):
     J, x_dot, wish = J3[:rows], np.ones(rows), np.array([1.0, -2.0, 0.5])

@@ -159,16 +159,6 @@ def test_clearance_is_the_distance_of_the_nearest_of_many_points_of_the_arm():
     assert not arm.clearance_gradient([0.0, 0.0, 0.0], [0.3, 0.0]).any()  # it touches the first link
 
 
-def test_joints_go_on_turning_and_one_step_is_many():
-    arm, q, q_dot = an_arm(3)
-    here = q
-    for _ in range(100):
-        here = arm.integrate(here, q_dot, 0.1)
-    close(arm.integrate(q, q_dot, 10.0), here)
-    close(here, q + 10.0 * q_dot)
-    close(arm.integrate(q, q_dot, np.arange(5.0))[:, 3], (q + 3.0 * q_dot)[:, 3])
-
-
 # --- What the null space is for
 
 
@@ -222,14 +212,6 @@ def test_the_tip_of_a_mobile_manipulator_is_base_and_mount_and_arm(n):
     assert MobileManipulator(R, L, robot.arm).mount.tolist() == [0.0, 0.0]
 
 
-def test_one_link_straight_ahead_is_the_offset_point():
-    theta = np.linspace(-3.0, 3.0, 20)
-    robot = MobileManipulator(R, L, PlanarArm([0.2]))
-    q = np.column_stack([theta, theta, theta, 0.0 * theta])
-    close(robot.jacobian(q)[..., :2], dd.offset_point_jacobian(theta, R, L, 0.2), 1e-15)
-    close(robot.forward_kinematics(q)[:, :2], dd.offset_point(q[:, :3], 0.2), 1e-15)
-
-
 @links
 def test_one_step_is_many_and_the_base_drives_as_if_alone(n):
     robot, q, q_dot = a_robot(n)
@@ -242,6 +224,9 @@ def test_one_step_is_many_and_the_base_drives_as_if_alone(n):
     v, omega = dd.wheel_to_body(q_dot[..., 0], q_dot[..., 1], R, L)
     same_pose(there, se2.integrate(q[..., :3], np.stack([v, omega], axis=-1), 1.0))
     close(there[..., 3:], q[..., 3:] + q_dot[..., 2:])
+    # Joints go on turning, on an arm alone, too.
+    alone = robot.arm.integrate(q[..., 3:], q_dot[..., 2:], np.arange(5.0))
+    close(alone[:, 3], q[:, 3, 3:] + 3.0 * q_dot[:, 3, 2:])
 
 
 # --- The wheel as a contact

@@ -1,0 +1,239 @@
+"""Control laws that drive a unicycle to a goal, and a turn in place.
+
+State: pose `[x, y, theta]` (m, m, rad). Output: body twist `(v, omega)`, each of shape (...) (m/s,
+rad/s). Everything broadcasts over leading axes, the gains too. A last axis of a wrong length, values
+that are not finite or out of their range, shapes that do not broadcast, and twists that overflow raise
+ValueError.
+
+Source: document A, equations (9)-(11); document B, "Let's add a control point offset"; M. Aicardi,
+G. Casalino, A. Bicchi, A. Balestrino, "Closed loop steering of unicycle-like vehicles via Lyapunov
+techniques", IEEE Robotics & Automation Magazine 2(1), 1995; doc/mathematics.md, "Control laws".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import tau
+from typing import Any
+
+from diffdrive_jacobian.control.controller import KV, OFFSET, Boundary, Controller, GainValues
+from diffdrive_jacobian.kinematics import diff_drive
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
+from diffdrive_jacobian.numerics.checks import offset, positive
+from diffdrive_jacobian.numerics.elementary import atan2, cos, hypot, minimum, sin, sinc, where, wrap
+from diffdrive_jacobian.numerics.formula import Number, Vector, formula
+
+# --- To a position
+
+
+@formula('(3),(2),(),() -> (),()')
+def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Number, Number]:
+    """Compute the twist that drives a unicycle to a position.
+
+    `e = wrap(atan2(y_g - y, x_g - x) - theta)`, `omega = Kp e`, `v = Kv d cos(e)`, where d is the
+    distance. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never grows. With `Kp <
+    Kv` the heading error does not converge to zero and the robot spirals in. Exactly on the goal, where
+    the heading towards it is undefined, v and omega are zero.
+
+    When the law is sampled, the robot arrives with `Kp < 2 rate` and `Kv < rate`, and if commands take
+    effect up to one sample late, with `Kp + Kv < rate`. Half of that is recommended.
+
+    Args:
+        state: Pose of the robot, shape (..., 3).
+        goal: Position `[x, y]`, shape (..., 2) (m).
+        Kp: Gain on the heading error, shape (...) (1/s).
+        Kv: Gain on the distance, shape (...) (1/s).
+    """
+    x, y, theta = state
+    x_goal, y_goal = goal
+    d = hypot(x_goal - x, y_goal - y)
+    theta_d = atan2(y_goal - y, x_goal - x)
+    e = wrap(theta_d - theta)
+    v = Kv * d * cos(e)
+    omega = Kp * e
+    # On the goal there is no heading towards it.
+    return v, where(d > 0.0, omega, 0.0)
+
+
+def _go_to_goal_advice(gains: GainValues, limits: VelocityLimits) -> Iterator[str]:
+    if gains.kp <= gains.kv:
+        yield (
+            f'kp {gains.kp:g} is not larger than kv {gains.kv:g}: the robot approaches faster than it '
+            'turns and spirals in; choose kp > kv'
+        )
+
+
+GO_TO_GOAL = Controller(
+    name='go_to_goal',
+    law=go_to_goal,
+    summary="document A's law, to a position",
+    advice=_go_to_goal_advice,
+    slope=lambda gains: gains.kp + gains.kv,
+    boundary=Boundary(ratio=1.0, beyond='with a larger kv the robot spirals in'),
+)
+
+
+@formula('(),(),() -> (),()')
+def turn_in_place(theta: Number, heading: Number, Kp: Number) -> tuple[Number, Number]:
+    """Compute the twist that turns to a heading by the smaller angle.
+
+    `v = 0`, `omega = Kp wrap(heading - theta)`, of headings (rad) and the gain Kp (1/s), each of shape
+    (...). When the law is sampled, it converges with `Kp < 2 rate`. If commands take effect up to one
+    sample late, it converges from rest with `Kp < rate`. Half of that is recommended.
+    """
+    return 0.0, Kp * wrap(heading - theta)
+
+
+# --- With an offset point to a position
+
+
+@formula('(3),(2),(),() -> (),()', d=offset)
+def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Number, Number]:
+    """Compute the twist that drives the offset point along a straight line: `p_d_dot = k (goal - p_d)`.
+
+    Unlike the axle centre, whose Jacobian has rank 1, a point at a distance in front of it (behind it,
+    if d is negative) can be driven in every direction.
+
+    As wheel speeds the law is `w = J_d^-1 k (goal - p_d)`. Here it is the body twist `u = J_w w`: `v = k
+    a`, `omega = k b / d`, where `[a, b]` is the vector from the point to the goal in the body frame. The
+    distance of the point decays as exp(-k t), whatever the heading. The point comes to rest on the goal,
+    the axle centre at a distance |d| from it. When the law is sampled, this requires `k distance < 2 |d|
+    rate` and `k < rate`, and if commands take effect up to one sample late, `k (1 + distance / |d|) <
+    rate`. With a shorter offset the robot turns too far when the goal is far away.
+
+    Args:
+        state: Pose of the robot, shape (..., 3).
+        goal: Position for the point `[x, y]`, shape (..., 2) (m).
+        k: Gain on the distance, shape (...) (1/s).
+        d: X coordinate of the point in the body frame, not 0, shape (...) (m).
+    """
+    x_d, y_d = diff_drive.offset_point.formula(state, d)
+    x_goal, y_goal = goal
+    x_dot, y_dot = k * (x_goal - x_d), k * (y_goal - y_d)
+    # The inverse of [x_dot, y_dot] = R(theta) [[1, 0], [0, d]] [v, omega], which is J_d without J_w.
+    _, _, theta = state
+    v = cos(theta) * x_dot + sin(theta) * y_dot
+    omega = (cos(theta) * y_dot - sin(theta) * x_dot) / d
+    return v, omega
+
+
+def _offset_point_advice(gains: GainValues, limits: VelocityLimits) -> Iterator[str]:
+    if limits.min_v == 0.0:
+        yield (
+            'linear.x.min_velocity is 0: the robot may not back up, which controller offset_point does '
+            'where the goal lies behind; it may come to rest before the goal'
+        )
+
+
+OFFSET_POINT = Controller(
+    name='offset_point',
+    law=offset_point,
+    summary='input-output linearization at an offset point, document B',
+    gains=(KV, OFFSET),
+    offset='offset',
+    advice=_offset_point_advice,
+    # At the goal. At a distance it is larger by kv distance / |offset|.
+    slope=lambda gains: gains.kv,
+)
+
+
+# --- To a position and a heading
+
+FASTER = 2.0
+"""Ratio of the default rates at which heading and distance converge [-]."""
+STEEPEST = 2.74
+"""Largest slope of `phi cos(alpha) sin(alpha) / alpha` over alpha, with phi = pi [-]."""
+
+
+@formula('(3),(3),(),(),() -> (),()', Kp=positive, Kv=positive, h=positive)
+def go_to_pose(
+    state: Vector, goal: Vector, Kp: Number, Kv: Number, h: Number = None
+) -> tuple[Number, Number]:
+    """Compute the twist that drives a unicycle to a position and a heading.
+
+    In polar coordinates about the goal, with the distance rho, the bearing alpha of the goal relative to
+    the robot's heading, and the same bearing phi relative to the goal's heading, a unicycle moves as
+
+        rho_dot = -v cos(alpha),  alpha_dot = v sin(alpha) / rho - omega,  phi_dot = v sin(alpha) / rho
+
+    The law is `v = Kv rho cos(alpha)`, as in document A's law, and `omega = Kp alpha + Kv cos(alpha)
+    sin(alpha)/alpha (alpha + h phi)`. In continuous time `V = rho^2 + alpha^2 + h phi^2` never grows,
+    and all three converge to zero. Exactly on the goal's position, where the bearing is undefined, v and
+    omega are zero.
+
+    Near the goal, heading and bearing behave like an oscillator of frequency `Kv sqrt(h)` with damping
+    Kp, and the distance decays like exp(-Kv t). For the heading to converge first, Kp should be above 2
+    Kv. A weight larger than necessary leads to longer paths. If the goal lies behind, the robot backs up
+    while it turns to it and then drives forwards. If it may not back up, it turns first.
+
+    When the law is sampled with `Kp > 2 Kv`, the robot arrives with `K = Kp + Kv (1 + 2.74 h)` below
+    twice the rate, and if commands take effect up to one sample late, with K below the rate. Half of
+    that is recommended. With the default h, K is at most `6.5 Kp`.
+
+    Args:
+        state: Pose of the robot, shape (..., 3).
+        goal: Desired pose `[x, y, theta]`, shape (..., 3).
+        Kp: Gain on the bearing, positive, shape (...) (1/s).
+        Kv: Gain on the distance, positive, shape (...) (1/s).
+        h: Weight of the heading, positive, shape (...). None: `(Kp / (2 Kv))^2`, which is critical
+            damping, or for `Kp > 4 Kv` the smaller `2 Kp / Kv - 4`, with which the heading decays like
+            exp(-2 Kv t).
+    """
+    x, y, theta = state
+    x_goal, y_goal, heading = goal
+    if h is None:
+        h = default_weight(Kp, Kv)
+    rho = hypot(x_goal - x, y_goal - y)
+    bearing = atan2(y_goal - y, x_goal - x)
+    alpha, phi = wrap(bearing - theta), wrap(bearing - heading)
+    v = Kv * rho * cos(alpha)
+    omega = Kp * alpha + Kv * cos(alpha) * sinc(alpha) * (alpha + h * phi)
+    # On the goal there is no bearing.
+    return v, where(rho > 0.0, omega, 0.0)
+
+
+def default_weight(Kp: Number, Kv: Number) -> Number:
+    """Compute the weight of the heading that `go_to_pose` takes by default, unchecked."""
+    least = minimum(Kp, 2.0 * FASTER * Kv)
+    # The parabola is continued by its tangent.
+    return (least / (2.0 * Kv)) ** 2 + FASTER * (Kp - least) / Kv
+
+
+def _pose_slope(gains: GainValues) -> float:
+    return float(gains.kp + gains.kv * (1.0 + STEEPEST * default_weight(gains.kp, gains.kv)))
+
+
+def _pose_advice(gains: GainValues, limits: VelocityLimits) -> Iterator[str]:
+    if gains.kp <= 2.0 * gains.kv:
+        yield (
+            f'kp {gains.kp:g} is not larger than twice kv {gains.kv:g}: the robot reaches the position '
+            'before the heading, and turns in place there; choose kp > 2 kv'
+        )
+
+
+POSE = Controller(
+    name='pose',
+    law=go_to_pose,
+    summary='to a position and a heading',
+    takes_heading=True,
+    advice=_pose_advice,
+    slope=_pose_slope,
+    boundary=Boundary(ratio=2.0, beyond='with a larger kv the robot turns on the spot at the goal'),
+)
+
+GOAL_CONTROLLERS = (GO_TO_GOAL, OFFSET_POINT, POSE)
+
+
+# --- Sampling
+
+LARGEST_TURN = 7.0 / 8.0 * tau
+"""Largest turn per sample that is left as it is (rad)."""
+
+
+def without_whole_turns(omega: Any, rate: float) -> Any:
+    """Return a yaw rate without the whole turns per sample. The heading at the next sample is the same.
+
+    A robot that makes a whole turn per sample comes back to where it was, and so never arrives. omega
+    (rad/s) of shape (...), sampled at a rate (Hz), is left as it is up to a turn of 7/8 per sample.
+    """
+    return where(abs(omega) <= LARGEST_TURN * rate, omega, wrap(omega / rate) * rate)
