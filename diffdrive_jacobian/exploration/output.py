@@ -8,19 +8,26 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child
-from diffdrive_jacobian.exploration.replay import BAG, PICTURE, record
+from diffdrive_jacobian.bags import BagError, read_run
+from diffdrive_jacobian.exploration.processes import ChildDiedError, call_in_child, can_run_here
 from diffdrive_jacobian.exploration.result import LONGEST_KEY, Finding
 from diffdrive_jacobian.exploration.scenario import ExplorationError, ScenarioName, Source
-from diffdrive_jacobian.exploration.worker import can_run_here
+from diffdrive_jacobian.exploration.trial import Setting, Trial, run
+from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.plots.fault_marks import ViolationMark
+from diffdrive_jacobian.plots.run_figure import draw
+from diffdrive_jacobian.recording.recorder import Recorder, Selection
+from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.text import error_text, printable
 
+BAG, PICTURE = 'run', 'run.png'
+"""Names of the bag and of the picture."""
 CASE = 'counterexample.json'
 """Name of the file with the case."""
 MARK = '.written_by_explore'
@@ -226,6 +233,41 @@ def _record(finding: Finding, folder: Path, executor: Executor) -> list[str]:
 
 def _record_in_process(*arguments: Any) -> list[str]:
     return list(record(*arguments) if can_run_here() else call_in_child(record, *arguments))
+
+
+def record(setting: Setting, trial: Trial, only: int, folder: str) -> list[str]:
+    """Run a world, write its bag and its picture into a folder, and return what could not be written."""
+    bag = Path(folder) / BAG
+    ended = 0
+
+    @contextmanager
+    def recording(world: Lockstep) -> Iterator[None]:
+        nonlocal ended
+        writing = Recording(bag, 'mcap', lossless=True)
+        recorder = Recorder(Selection(everything=True), writing)
+        world.add(recorder, observer=True)
+        world.on_new_topics(recorder.discover)
+        recorder.discover()
+        try:
+            yield
+        finally:
+            ended = world.now
+            writing.finish()
+
+    try:
+        outcome = run(setting, trial, only=only, during=recording)
+    except (RecordingError, OSError) as error:
+        return [f'no bag: {error}']
+    # A violation ends the world.
+    marks = [
+        ViolationMark(ended, f'violated: {one.key}' if one.index >= 0 else one.key)
+        for one in outcome.violations[:1]
+    ]
+    try:
+        draw([read_run(bag)], Path(folder) / PICTURE, violations=marks)
+    except (BagError, ModuleNotFoundError, OSError) as error:
+        return [f'no picture: {error}']
+    return []
 
 
 def _case(finding: Finding, seed: int) -> str:

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from diffdrive_jacobian import signals
 from diffdrive_jacobian.control import find_controller
-from diffdrive_jacobian.exploration.child import call_in_child
+from diffdrive_jacobian.exploration.processes import call_in_child
 from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.properties import NeverFasterThan
 from diffdrive_jacobian.simulation import Sweep, SweepSetup, sweep
@@ -135,7 +135,7 @@ def test_two_sigint_of_one_request_end_an_exploration_once(monkeypatch):
 
 
 ENDLESS = """
-from diffdrive_jacobian.exploration.child import ChildProcess
+from diffdrive_jacobian.exploration.processes import ChildProcess
 child = ChildProcess()
 print(child._process.pid, flush=True)
 child.call(exec, 'print("busy", flush=True)\\nwhile True: pass')

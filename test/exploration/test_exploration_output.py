@@ -11,8 +11,8 @@ import pytest
 from exploration_scenarios import Follower, Sensor, failing, follow, robot, serial
 from hypothesis import strategies as st
 
-from diffdrive_jacobian.exploration.child import _picklable
-from diffdrive_jacobian.exploration.worker import result_of
+from diffdrive_jacobian.exploration.exploring import result_of
+from diffdrive_jacobian.exploration.processes import _picklable
 from diffdrive_jacobian.faults import Hang, Loss
 from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.plots.fault_marks import VIOLATION
