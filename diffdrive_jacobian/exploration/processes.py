@@ -201,10 +201,7 @@ def can_run_here() -> bool:
 
 
 def run_worlds(data: bytes) -> list[Outcome]:
-    """Run worlds, in this process if it can run a `Lockstep`, else in one of its own.
-
-    Args:
-        data: From `packed`.
+    """Run `packed` worlds, in this process if it can run a `Lockstep`, else in one of its own.
 
     Raises:
         ExplorationError: The scenario cannot be imported, or a fault or property is invalid.
@@ -221,12 +218,7 @@ def run_worlds(data: bytes) -> list[Outcome]:
 
 
 def run_world(data: bytes, *, afresh: bool = True) -> list[Outcome]:
-    """Run one world in a process. If `afresh`, no other world has left anything behind there.
-
-    Args:
-        data: From `packed`, with one trial.
-        afresh: Whether the process is new.
-    """
+    """Run one `packed` world in a process, in a new one if `afresh`. That it ends it is a finding."""
     try:
         return list(call_in_child(_run_here, data, afresh=afresh))
     except ChildDiedError as error:

@@ -233,14 +233,7 @@ class Replay:
         found: tuple[str, float, str],
         found_with: dict[str, str],
     ) -> Replay:
-        """Compare a run with what was found.
-
-        Args:
-            violation: What the run has violated.
-            digest: The hash of its messages.
-            found: Key and time of the violation that was found, and the hash of the messages.
-            found_with: The `versions` with which it was found.
-        """
+        """Compare violation and digest of a run with key, time and digest of what was found."""
         return cls(
             violation=violation,
             same_verdict=violation is not None and violation.key == found[0],

@@ -157,17 +157,13 @@ def seconds(world: Lockstep) -> float:
     return world.world_time / NANOSECONDS
 
 
-During = Callable[[Lockstep], AbstractContextManager[Any]]
-"""Returns a context manager in which the scenario of a world runs."""
-
-
 def run(
     setting: Setting,
     trial: Trial,
     *,
     only: int | None = None,
     digest: bool = False,
-    during: During = nullcontext,
+    during: Callable[[Lockstep], AbstractContextManager[Any]] = nullcontext,
 ) -> Outcome:
     """Run one world.
 
