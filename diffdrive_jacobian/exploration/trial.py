@@ -97,8 +97,6 @@ class Outcome:
     """In the order in which they happened."""
     checks: int = 0
     """How often a property was checked."""
-    events: int = 0
-    """How often faults acted."""
     seconds: float = 0.0
     """Duration in simulated time (s)."""
     complaints: tuple[str, ...] = ()
@@ -207,7 +205,6 @@ def run(
         return Outcome(
             violations=tuple(violations),
             checks=sum(one.checks for one in properties),
-            events=len(world.fault_events),
             seconds=seconds(world),
             complaints=complaints,
             digest='' if messages is None else messages.value(),
