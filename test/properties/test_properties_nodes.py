@@ -169,7 +169,7 @@ def test_a_late_goal_is_accepted_by_the_controller_of_this_package(lockstep, lat
 @pytest.mark.slow
 @pytest.mark.parametrize('lookahead', [None, 0.8])
 def test_go_to_goal_stays_on_an_eight_unless_it_looks_far_ahead(lockstep, robot_at, lookahead):
-    robot_at()
+    robot_at(publish_rate=20.0)
     node = lockstep.add(make(GoToGoal))
     lockstep.require(StaysOnPath(0.03, within=24.0))
     if lookahead:
