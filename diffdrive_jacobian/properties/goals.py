@@ -317,7 +317,8 @@ class _DueGoalWatch(_GoalWatch[DueGoalProperty]):
         world.expect(*map(required.resolved, required.goals))
         for topic in required.goals:
             world.on_delivered(required.resolved(topic), self._on_goal)
-        self._commands = self.on_published(required.commands, lambda one, _: self.check_observable(one))
+        self._commands = world.node.resolve_topic_name(required.resolved(required.commands))
+        world.expect(self._commands)
         world.on_published(required.resolved(required.status), self._on_status)
         world.on_response(required.resolved(required.cancel), self._on_cancel)
 
