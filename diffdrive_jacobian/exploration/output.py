@@ -8,19 +8,29 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from itertools import count, groupby
+from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child
-from diffdrive_jacobian.exploration.replay import BAG, PICTURE, record
+from diffdrive_jacobian.bags import BagError, read_run
+from diffdrive_jacobian.exploration.processes import ChildDiedError, call_in_child, can_run_here
 from diffdrive_jacobian.exploration.result import LONGEST_KEY, Finding
-from diffdrive_jacobian.exploration.scenario import ExplorationError, ScenarioName, Source
-from diffdrive_jacobian.exploration.worker import can_run_here
+from diffdrive_jacobian.exploration.scenario import ExplorationError, Source
+from diffdrive_jacobian.exploration.trial import Setting, Trial, run
+from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.plots.fault_marks import ViolationMark
+from diffdrive_jacobian.plots.run_figure import draw
+from diffdrive_jacobian.recording.recorder import Recorder, Selection
+from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.text import error_text, printable
 
+BAG, PICTURE = 'run', 'run.png'
+"""Names of the bag and of the picture."""
+TESTING = 'diffdrive_jacobian.testing'
 CASE = 'counterexample.json'
 """Name of the file with the case."""
 MARK = '.written_by_explore'
@@ -38,8 +48,7 @@ Found and written by explore(seed={seed}). Passes once the controller is mended.
 HERE = Path(__file__).resolve().parent
 {loads}
 CASE = {case}
-FAULTS = [{faults}]
-
+{faults}
 
 {marker}def test_{name}(lockstep):
 {inject}{require}    with reproducing(lockstep, HERE / '{file}'):
@@ -67,40 +76,32 @@ def write_finding(
     output: Path,
     others: Sequence[Finding],
     *,
-    seed: int = 0,
+    seed: int,
     executor: Executor | None = None,
 ) -> Finding:
     """Write a finding into a folder of its own, in the place of one of an earlier exploration.
 
     Nothing else is overwritten: where it is in the way, the folder gets a number. What cannot be written
-    is noted in the finding.
-
-    Args:
-        finding: The finding.
-        output: Folder of all findings.
-        others: Findings that have a folder already.
-        seed: Seed of the exploration.
-        executor: Runs the case again, to write the bag and the picture, on this machine; None: these are
-            not written.
-
-    Returns:
-        The finding, with its folder.
+    is noted in the finding that is returned. `others` have a folder already. The executor runs the case
+    again, to write the bag and the picture. Without one these are not written.
     """
     taken = {other.directory for other in others}
     stem = re.sub(r'\W+', '_', finding.violation.name)
-    number, folder = 1, output / stem
-    while folder in taken or not _is_free(folder):
-        number += 1
-        folder = output / f'{stem}_{number}'
+    folders = (output / (stem if number == 1 else f'{stem}_{number}') for number in count(1))
+    folder = next(one for one in folders if one not in taken and _is_free(one))
     notes = list(finding.notes)
     try:
         _remove(folder)
         folder.mkdir(exist_ok=True)
-        test = _test(folder)
-        _create(folder / MARK, MARK_TITLE.format(folder=folder.name) + '\n')
-        _create(folder / CASE, _case(finding, seed))
-        _create(test, test_source(finding, folder, test.stem.removeprefix('test_'), seed))
-        _mark(folder, [folder / CASE, test])
+        case, test = folder / CASE, _test(folder)
+        for path, text in (
+            (folder / MARK, MARK_TITLE.format(folder=folder.name) + '\n'),
+            (case, _case(finding, seed)),
+            (test, test_source(finding, folder, test.stem.removeprefix('test_'), seed)),
+        ):
+            with path.open('x', encoding='utf-8') as file:
+                file.write(text)
+        _mark(folder, [case, test])
         if executor is not None:
             notes += _record(finding, folder, executor)
     except OSError as error:
@@ -113,10 +114,6 @@ def remove_others(output: Path, findings: Sequence[Finding]) -> None:
 
     A folder that was renamed or copied stays, and so does one in which a file was changed or renamed.
     Files that were added stay, too.
-
-    Args:
-        output: Folder of all findings.
-        findings: What was found now.
     """
     kept = {finding.directory.name for finding in findings if finding.directory is not None}
     for mark in output.glob(f'*/{MARK}'):
@@ -178,13 +175,7 @@ def _remove(folder: Path) -> None:
 
 def _test(folder: Path) -> Path:
     """Return the path of the test in the folder of a finding."""
-    return folder / f'test_{_snake(folder.name)}.py'
-
-
-def _create(path: Path, text: str) -> None:
-    """Write a file that does not exist yet."""
-    with path.open('x', encoding='utf-8') as file:
-        file.write(text)
+    return folder / f'test_{re.sub("(?<=[a-z0-9])(?=[A-Z])", "_", folder.name).lower()}.py'
 
 
 def _mark(folder: Path, files: Iterable[Path]) -> None:
@@ -228,6 +219,41 @@ def _record_in_process(*arguments: Any) -> list[str]:
     return list(record(*arguments) if can_run_here() else call_in_child(record, *arguments))
 
 
+def record(setting: Setting, trial: Trial, only: int, folder: str) -> list[str]:
+    """Run a world, write its bag and its picture into a folder, and return what could not be written."""
+    bag = Path(folder) / BAG
+    ended = 0
+
+    @contextmanager
+    def recording(world: Lockstep) -> Iterator[None]:
+        nonlocal ended
+        writing = Recording(bag, 'mcap', lossless=True)
+        recorder = Recorder(Selection(everything=True), writing)
+        world.add(recorder, observer=True)
+        world.on_new_topics(recorder.discover)
+        recorder.discover()
+        try:
+            yield
+        finally:
+            ended = world.now
+            writing.finish()
+
+    try:
+        outcome = run(setting, trial, only=only, during=recording)
+    except (RecordingError, OSError) as error:
+        return [f'no bag: {error}']
+    # A violation ends the world.
+    marks = [
+        ViolationMark(ended, f'violated: {one.key}' if one.index >= 0 else one.key)
+        for one in outcome.violations[:1]
+    ]
+    try:
+        draw([read_run(bag)], Path(folder) / PICTURE, violations=marks)
+    except (BagError, ModuleNotFoundError, OSError) as error:
+        return [f'no picture: {error}']
+    return []
+
+
 def _case(finding: Finding, seed: int) -> str:
     source = Source()
     scenario, trial, violation = finding.setting.scenario, finding.trial, finding.violation
@@ -248,43 +274,32 @@ def _case(finding: Finding, seed: int) -> str:
 
 
 def test_source(finding: Finding, folder: Path, name: str, seed: int) -> str:
-    """Return the source of a test that reproduces a finding.
-
-    Args:
-        finding: The finding.
-        folder: Folder of the test and of the case.
-        name: Name of the test, without `test_`.
-        seed: Seed of the exploration.
-    """
+    """Return the source of a test in a folder, `test_` and its name, that reproduces a finding."""
     source = Source()
     setting, trial, violation = finding.setting, finding.trial, finding.violation
+    scenario = setting.scenario
     case = source.expression(trial.case)
-    faults = ', '.join(source.expression(fault) for fault in trial.faults)
+    faults = ', '.join(map(source.expression, trial.faults))
     required = ''
-    if violation.index >= 0:
-        expression = source.expression(setting.properties[violation.index])
-        required = f'    lockstep.require({expression})\n'
-    local = {one for one in source.imports if not one[0].startswith('diffdrive_jacobian.')}
-    imports = ['from pathlib import Path', '']
-    marker = ''
-    if setting.args:
-        imports += ['import pytest', '']
-        marker = f'@pytest.mark.lockstep(args={list(setting.args)!r})\n'
-    names: dict[str, list[str]] = {'diffdrive_jacobian.testing': ['reproducing', 'scenario_from']}
-    for module, member in source.imports - local:
-        names.setdefault(module, []).append(member)
-    if setting.scenario.root is None:
-        names[setting.scenario.module] = [setting.scenario.name]
-        names['diffdrive_jacobian.testing'].remove('scenario_from')
-    loads = [_load(folder, setting.scenario, setting.scenario.module, setting.scenario.name)]
-    loads += [_load(folder, setting.scenario, *one) for one in sorted(local)]
-    loads = [line for line in loads if line]
-    imports += [f'from {module} import {", ".join(sorted(names[module]))}' for module in sorted(names)]
     key = printable(violation.key, LONGEST_KEY)
     title, description = f'{key}, at {violation.seconds:g} s.', violation.headline
     if violation.index >= 0:
         title = f'{key} is violated at {violation.seconds:g} s.'
         description = '\n'.join(violation.text.strip().splitlines()[:10])
+        expression = source.expression(setting.properties[violation.index])
+        required = f'    lockstep.require({expression})\n'
+    imported = {(TESTING, 'reproducing')}
+    loads = []
+    for module, member in ((scenario.module, scenario.name), *sorted(source.imports)):
+        if scenario.root is None or module.startswith('diffdrive_jacobian.'):
+            imported.add((module, member))
+        else:
+            place = _place(Path(scenario.root), folder.resolve())
+            loads.append(f'{member} = scenario_from({place}, {module!r}, {member!r})')
+            imported.add((TESTING, 'scenario_from'))
+    imports = ['from pathlib import Path', '', *(['import pytest', ''] if setting.args else [])]
+    for module, group in groupby(sorted(imported), key=itemgetter(0)):
+        imports.append(f'from {module} import {", ".join(member for _, member in group)}')
     return TEST.format(
         title=_quoted(title),
         description=_quoted(description),
@@ -292,32 +307,24 @@ def test_source(finding: Finding, folder: Path, name: str, seed: int) -> str:
         imports='\n'.join(imports) + '\n',
         loads='\n'.join(loads),
         case=case,
-        faults=faults,
-        marker=marker,
+        faults=f'FAULTS = [{faults}]\n' if trial.faults else '',
+        marker=f'@pytest.mark.lockstep(args={list(setting.args)!r})\n' if setting.args else '',
         name=name,
         inject=f'    lockstep.inject(*FAULTS, seed={trial.seed})\n' if trial.faults else '',
         require=required,
         file=CASE,
-        scenario=setting.scenario.name,
-    ).replace('FAULTS = []\n', '')
-
-
-def _load(folder: Path, scenario: ScenarioName, module: str, name: str) -> str:
-    """Return the line that imports an object of the user."""
-    if scenario.root is None:
-        return '' if name == scenario.name else f'from {module} import {name}'
-    root, here = Path(scenario.root), folder.resolve()
-    common = Path(os.path.commonpath([root, here]))
-    place = (
-        f'HERE / {os.path.relpath(root, here)!r}' if common != Path(common.anchor) else repr(str(root))
+        scenario=scenario.name,
     )
-    return f'{name} = scenario_from({place}, {module!r}, {name!r})'
+
+
+def _place(root: Path, folder: Path) -> str:
+    """Return an expression for a folder, relative to that of the test unless only `/` is common."""
+    common = Path(os.path.commonpath([root, folder]))
+    if common == Path(common.anchor):
+        return repr(str(root))
+    return f'HERE / {os.path.relpath(root, folder)!r}'
 
 
 def _quoted(text: str) -> str:
     """Return a text that can stand in a docstring."""
     return text.replace('\\', '\\\\').replace('"""', "'''")
-
-
-def _snake(name: str) -> str:
-    return re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '_', name).lower()

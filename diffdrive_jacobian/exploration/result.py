@@ -1,23 +1,78 @@
-"""The result of an exploration."""
+"""The result of an exploration, and running a finding again."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from diffdrive_jacobian.exploration.scenario import Source
-from diffdrive_jacobian.exploration.trial import Setting, Trial, Violation
-from diffdrive_jacobian.exploration.versions import versions
+import numpy as np
+
+from diffdrive_jacobian import __version__
+from diffdrive_jacobian.exploration.processes import packed, run_world, run_worlds
+from diffdrive_jacobian.exploration.scenario import ExplorationError, Source
+from diffdrive_jacobian.exploration.trial import (
+    DIED,
+    MessageDigest,
+    Setting,
+    Trial,
+    Violation,
+    of_exception,
+)
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.text import printable
-
-if TYPE_CHECKING:
-    from diffdrive_jacobian.exploration.replay import Replay
 
 LONGEST_KEY = 200
 """Length beyond which a property is cut where it is a title (characters)."""
 NOTED = 10
 """Number of notes that are printed."""
+
+
+def versions() -> dict[str, str]:
+    """Return the versions and the processor on which the last bit of a run may depend.
+
+    Elsewhere a run may differ by rounding: NumPy and the C library choose their code by the features of
+    the processor.
+    """
+    rclpy = 'unknown'
+    for name in ('rclpy', 'ros-rclpy'):
+        with suppress(PackageNotFoundError):
+            rclpy = version(name)
+    return {
+        'diffdrive_jacobian': __version__,
+        'python': platform.python_version(),
+        'numpy': np.__version__,
+        'rclpy': rclpy,
+        'libc': ' '.join(platform.libc_ver()),
+        'machine': platform.machine(),
+        'processor features': _processor(),
+    }
+
+
+def _processor() -> str:
+    """Return a hash of the features of the processor, as Linux lists them."""
+    try:
+        lines = Path('/proc/cpuinfo').read_text(errors='replace').splitlines()
+    except OSError:
+        return 'unknown'
+    flags = next(
+        (line.partition(':')[2] for line in lines if line.startswith(('flags', 'Features'))), ''
+    )
+    return hashlib.sha256(' '.join(sorted(flags.split())).encode()).hexdigest()[:16]
+
+
+def differences(here: dict[str, str], there: dict[str, str]) -> list[str]:
+    """Return what differs between two results of `versions`, one line for each."""
+    return [
+        f'{name} {here.get(name, "unknown")} here, {there.get(name, "unknown")} there'
+        for name in dict.fromkeys([*here, *there])
+        if here.get(name) != there.get(name)
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,13 +173,24 @@ class Exploration:
     def replay(self, finding: Finding | None = None) -> Replay:
         """Run the smallest case of a finding again (default: the first finding), and compare.
 
+        It runs in a process of its own if need be.
+
         Raises:
             ExplorationError: Nothing was found.
         """
-        # Not above: it imports this module.
-        from diffdrive_jacobian.exploration.replay import replay
-
-        return replay(finding or next(iter(self.findings), None))
+        finding = finding or next(iter(self.findings), None)
+        if finding is None:
+            raise ExplorationError('there is nothing to replay: no property was violated')
+        found = finding.violation
+        data = packed(finding.setting, [finding.trial], only=found.index, digest=True)
+        # A world that ends its process must not end this one.
+        (outcome,) = (run_world if found.name == DIED else run_worlds)(data)
+        return Replay.compared(
+            outcome.of(found.key),
+            outcome.digest,
+            (found.key, found.seconds, finding.digest),
+            finding.versions,
+        )
 
     def __str__(self) -> str:
         """Return the statistics and the findings."""
@@ -144,3 +210,67 @@ class Exploration:
         if len(self.notes) > NOTED:
             lines.append(f'note: and {len(self.notes) - NOTED} more notes')
         return '\n\n'.join(['\n'.join(lines), *map(str, self.findings)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """The result of running the smallest case of a finding again."""
+
+    violation: Violation | None
+    """What it violates now; None: nothing."""
+    same_verdict: bool
+    """Whether the same property is violated."""
+    same_bits: bool
+    """Whether all messages are the same, bit for bit, and the violation comes at the same time."""
+    differences: tuple[str, ...]
+    """How versions and processor differ from those with which it was found."""
+
+    @classmethod
+    def compared(
+        cls,
+        violation: Violation | None,
+        digest: str,
+        found: tuple[str, float, str],
+        found_with: dict[str, str],
+    ) -> Replay:
+        """Compare violation and digest of a run with key, time and digest of what was found."""
+        return cls(
+            violation=violation,
+            same_verdict=violation is not None and violation.key == found[0],
+            same_bits=violation is not None and (violation.key, violation.seconds, digest) == found,
+            differences=tuple(differences(versions(), found_with)),
+        )
+
+    def __str__(self) -> str:
+        """Return a description of one line."""
+        different = self.differences
+        where = f'; {"; ".join(different)}' if different else ', with the same versions and processor'
+        if self.same_bits:
+            return f'the same as found, bit for bit{where}'
+        if self.same_verdict:
+            return f'violated as found, but not bit for bit{where}'
+        return f'not violated as it was found{where}'
+
+
+@contextmanager
+def reproducing(world: Lockstep, case: Path) -> Iterator[None]:
+    """Add to an exception that the body raises how it compares with what `explore` found.
+
+    It is the same bit for bit with the same versions and the same features of the processor. Elsewhere
+    the verdict is the same, but numbers may be rounded otherwise.
+
+    Args:
+        world: The world in which the body runs the case.
+        case: The file counterexample.json.
+    """
+    fields = json.loads(case.read_text(encoding='utf-8'))
+    found = fields['violation'], fields['seconds'], fields['digest']
+    with MessageDigest(world) as messages:
+        try:
+            yield
+        except (Exception, SystemExit) as error:
+            violation = of_exception(error, world)
+            compared = Replay.compared(violation, messages.value(), found, fields['versions'])
+            # As add_note of Python 3.11.
+            error.__notes__ = [*getattr(error, '__notes__', []), str(compared)]  # type: ignore[union-attr]
+            raise

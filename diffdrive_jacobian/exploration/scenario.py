@@ -9,7 +9,7 @@ import inspect
 import math
 import sys
 import sysconfig
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from types import ModuleType
@@ -37,27 +37,29 @@ class Source:
             ExplorationError: The value contains an object that is neither a number, text, a container
                 nor an instance of a dataclass.
         """
-        if isinstance(value, enum.Enum):
-            return f'{self._class(type(value))}.{value.name}'
-        if value is None or isinstance(value, (bool, str, bytes)):
-            return repr(value)
-        if isinstance(value, int):
-            return repr(int(value))
-        if isinstance(value, float):
-            return repr(float(value)) if math.isfinite(value) else f"float('{float(value)}')"
-        if isinstance(value, tuple) and hasattr(value, '_fields'):
-            return self._call(value, value._fields)
-        if isinstance(value, tuple):
-            return f'({", ".join(map(self.expression, value))}{"," * (len(value) == 1)})'
-        if isinstance(value, list):
-            return f'[{", ".join(map(self.expression, value))}]'
-        if isinstance(value, (set, frozenset)):
-            parts = ', '.join(sorted(map(self.expression, value)))
-            braces = f'{{{parts}}}' if value else 'set()'
-            return braces if isinstance(value, set) else f'frozenset({braces})'
-        if isinstance(value, dict):
-            pairs = (f'{self.expression(key)}: {self.expression(one)}' for key, one in value.items())
-            return f'{{{", ".join(pairs)}}}'
+        match value:
+            case enum.Enum():
+                return f'{self._class(type(value))}.{value.name}'
+            case None | bool() | str() | bytes():
+                return repr(value)
+            case int():
+                return repr(int(value))
+            case float():
+                return repr(float(value)) if math.isfinite(value) else f"float('{float(value)}')"
+            case tuple() if hasattr(value, '_fields'):
+                named = zip(value._fields, map(self.expression, value), strict=True)
+                return f'{self._class(type(value))}({", ".join(f"{name}={one}" for name, one in named)})'
+            case tuple():
+                return f'({", ".join(map(self.expression, value))}{"," * (len(value) == 1)})'
+            case list():
+                return f'[{", ".join(map(self.expression, value))}]'
+            case set() | frozenset():
+                parts = ', '.join(sorted(map(self.expression, value)))
+                braces = f'{{{parts}}}' if value else 'set()'
+                return braces if isinstance(value, set) else f'frozenset({braces})'
+            case dict():
+                pairs = (f'{self.expression(key)}: {self.expression(one)}' for key, one in value.items())
+                return f'{{{", ".join(pairs)}}}'
         if is_dataclass(value) and not isinstance(value, type):
             return self._dataclass(value)
         raise ExplorationError(
@@ -77,10 +79,6 @@ class Source:
             required = one.default is MISSING and one.default_factory is MISSING
             label = '' if required and not one.kw_only else f'{one.name}='
             parts.append(label + self.expression(given))
-        return f'{self._class(type(value))}({", ".join(parts)})'
-
-    def _call(self, value: Any, names: Iterable[str]) -> str:
-        parts = (f'{name}={self.expression(getattr(value, name))}' for name in names)
         return f'{self._class(type(value))}({", ".join(parts)})'
 
     def _class(self, kind: type) -> str:

@@ -48,19 +48,15 @@ def trials(cases: st.SearchStrategy[Any], faults: st.SearchStrategy[Any]) -> st.
 
     @st.composite
     def draw_trial(draw: st.DrawFn) -> Trial:
-        schedule = _schedule(draw(faults))
+        schedule = draw(faults)
+        if not isinstance(schedule, (list, tuple)):
+            raise ExplorationError(f'faults must be a strategy of lists of faults; it gave {schedule!r}')
         case = draw(cases)
         # Without faults the seed has no effect.
         seed = draw(st.integers(0, MAX_SEED)) if schedule else 0
-        return Trial(case=case, faults=schedule, seed=seed)
+        return Trial(case=case, faults=tuple(schedule), seed=seed)
 
     return draw_trial()
-
-
-def _schedule(drawn: Any) -> tuple[Any, ...]:
-    if not isinstance(drawn, (list, tuple)):
-        raise ExplorationError(f'faults must be a strategy of lists of faults; it gave {drawn!r}')
-    return tuple(drawn)
 
 
 def generate(strategy: st.SearchStrategy[Trial], seed: int, block: int, count: int) -> list[Trial]:
@@ -83,13 +79,8 @@ def shrink(
 ) -> Trial:
     """Return the smallest trial that fails among those that Hypothesis tries.
 
-    Args:
-        strategy: As for `generate`, as the next three, which gave a trial that fails.
-        seed: Seed of the exploration.
-        block: Number of the block.
-        count: Size of the block.
-        fails: Returns whether a trial fails. It must return the same for equal trials. It may raise
-            StopShrinking. Other exceptions end the search, too, and are raised.
+    `generate` with the same arguments gave a trial that fails. `fails` must return the same for equal
+    trials. It may raise StopShrinking. Other exceptions end the search, too, and are raised.
 
     Raises:
         ExplorationError: No trial of the block fails.
@@ -135,7 +126,9 @@ def _run(
     phases: list[Phase],
     use: Callable[[Trial], object],
 ) -> None:
-    @hypothesis.seed(_number(seed, block))
+    number = hashlib.sha256(f'{seed} {block}'.encode()).digest()[:8]
+
+    @hypothesis.seed(int.from_bytes(number, 'big'))
     @settings(
         max_examples=count,
         phases=phases,
@@ -160,27 +153,18 @@ def _run(
             raise ExplorationError(f'Hypothesis cannot generate worlds: {error}') from error
 
 
-def _number(seed: int, block: int) -> int:
-    """Return the seed of a block."""
-    return int.from_bytes(hashlib.sha256(f'{seed} {block}'.encode()).digest()[:8], 'big')
-
-
 @contextmanager
 def _own_constants_only() -> Iterator[None]:
     """Stop Hypothesis from using constants of the running program. Versions before 6.131 do not."""
     try:
         from hypothesis.internal.conjecture import providers
-    except ImportError:
+
+        internals: Any = providers
+        collect, none = internals._get_local_constants, internals.Constants()
+        cache = internals.CONSTANTS_CACHE.cache
+    except (ImportError, AttributeError):
         yield
         return
-    internals: Any = providers
-    collect = getattr(internals, '_get_local_constants', None)
-    make = getattr(internals, 'Constants', None)
-    cache = getattr(getattr(internals, 'CONSTANTS_CACHE', None), 'cache', None)
-    if collect is None or make is None or cache is None:
-        yield
-        return
-    none = make()
     internals._get_local_constants = lambda: none
     cache.clear()
     try:
@@ -314,67 +298,66 @@ def _or_zero(longest: float) -> st.SearchStrategy[float]:
     return st.one_of(st.just(0.0), _positive(longest))
 
 
-TOPIC_KINDS: dict[type[Fault], Callable[[], Fields]] = {
-    faults.Loss: lambda: {
-        'probability': probabilities(),
-        'burst': st.sampled_from((1, 2, 5, 10)),
+KINDS: dict[str, dict[type[Fault], Callable[[], Fields]]] = {
+    'topic': {
+        faults.Loss: lambda: {
+            'probability': probabilities(),
+            'burst': st.sampled_from((1, 2, 5, 10)),
+        },
+        faults.Delay: lambda: {
+            'spread': _or_zero(1.0),
+            'growth': st.sampled_from((0.0, 0.1, 0.5)),
+            'seconds': _positive(LONGEST),
+        },
+        faults.Stale: dict,
+        faults.Duplicate: lambda: {
+            'probability': probabilities(),
+            'copies': st.integers(1, 3),
+            'seconds': _or_zero(LONGEST),
+        },
+        faults.Reorder: lambda: {'probability': probabilities(), 'seconds': _positive(LONGEST)},
+        faults.RateLimit: lambda: {'rate': st.sampled_from(RATES)},
     },
-    faults.Delay: lambda: {
-        'spread': _or_zero(1.0),
-        'growth': st.sampled_from((0.0, 0.1, 0.5)),
-        'seconds': _positive(LONGEST),
+    'node': {
+        faults.Hang: dict,
+        faults.Kill: dict,
+        faults.Slow: lambda: {'seconds': st.sampled_from(SHORT)},
+        faults.TimerJitter: lambda: {'seconds': st.sampled_from(SHORT)},
     },
-    faults.Stale: dict,
-    faults.Duplicate: lambda: {
-        'probability': probabilities(),
-        'copies': st.integers(1, 3),
-        'seconds': _or_zero(LONGEST),
+    'service': {
+        faults.LateService: lambda: {'seconds': st.one_of(_positive(5.0), st.just(math.inf))},
     },
-    faults.Reorder: lambda: {'probability': probabilities(), 'seconds': _positive(LONGEST)},
-    faults.RateLimit: lambda: {'rate': st.sampled_from(RATES)},
-}
-"""Kinds of faults of topics, and strategies of their fields besides topic, start and duration."""
-NODE_KINDS: dict[type[Fault], Callable[[], Fields]] = {
-    faults.Hang: dict,
-    faults.Kill: dict,
-    faults.Slow: lambda: {'seconds': st.sampled_from(SHORT)},
-    faults.TimerJitter: lambda: {'seconds': st.sampled_from(SHORT)},
-}
-"""Kinds of faults of nodes."""
-SERVICE_KINDS: dict[type[Fault], Callable[[], Fields]] = {
-    faults.LateService: lambda: {'seconds': st.one_of(_positive(5.0), st.just(math.inf))},
-}
-"""Kinds of faults of services."""
-ROBOT_KINDS: dict[type[Fault], Callable[[], Fields]] = {
-    faults.Push: lambda: {
-        'noticed': st.booleans(),
-        'dtheta': numbers(-3.0, 3.0),
-        'dy': numbers(-1.0, 1.0),
-        'dx': numbers(-1.0, 1.0),
-    },
-    faults.DeadWheel: lambda: {'wheel': st.sampled_from(WHEELS)},
-    faults.SaturatedWheel: lambda: {
-        'wheel': st.sampled_from(WHEELS),
-        'max_velocity': numbers(0.1, 10.0),
-    },
-    faults.ActuatorLag: lambda: {'seconds': st.sampled_from(SHORT)},
-    faults.EncoderSteps: lambda: {'per_revolution': st.sampled_from((16, 64, 256, 1024))},
-    faults.Slip: dict,
-    faults.WrongGeometry: lambda: dict.fromkeys(
-        (
-            'left_wheel_radius_multiplier',
-            'right_wheel_radius_multiplier',
-            'wheel_separation_multiplier',
+    'robot': {
+        faults.Push: lambda: {
+            'noticed': st.booleans(),
+            'dtheta': numbers(-3.0, 3.0),
+            'dy': numbers(-1.0, 1.0),
+            'dx': numbers(-1.0, 1.0),
+        },
+        faults.DeadWheel: lambda: {'wheel': st.sampled_from(WHEELS)},
+        faults.SaturatedWheel: lambda: {
+            'wheel': st.sampled_from(WHEELS),
+            'max_velocity': numbers(0.1, 10.0),
+        },
+        faults.ActuatorLag: lambda: {'seconds': st.sampled_from(SHORT)},
+        faults.EncoderSteps: lambda: {'per_revolution': st.sampled_from((16, 64, 256, 1024))},
+        faults.Slip: dict,
+        faults.WrongGeometry: lambda: dict.fromkeys(
+            (
+                'left_wheel_radius_multiplier',
+                'right_wheel_radius_multiplier',
+                'wheel_separation_multiplier',
+            ),
+            st.sampled_from((1.0, 1.1, 0.9, 1.5, 0.5)),
         ),
-        st.sampled_from((1.0, 1.1, 0.9, 1.5, 0.5)),
-    ),
+    },
+    'clock': {
+        faults.ClockPause: dict,
+        faults.TimeJump: lambda: {'seconds': st.one_of(_positive(10.0), numbers(-10.0, -STEP))},
+    },
 }
-"""Kinds of faults of a `VirtualRobot`."""
-WORLD_KINDS: dict[type[Fault], Callable[[], Fields]] = {
-    faults.ClockPause: dict,
-    faults.TimeJump: lambda: {'seconds': st.one_of(_positive(10.0), numbers(-10.0, -STEP))},
-}
-"""Kinds of faults of the clock."""
+"""By what they affect: the kinds of faults, and strategies of their fields besides the name of that,
+start and duration."""
 
 
 def fault_schedules(
@@ -416,26 +399,16 @@ def fault_schedules(
             "fields must be a dict of lists by topic, such as {'odom': ['pose.pose.position.x']}; "
             f'got {fields!r}'
         )
-    for name, value in (
-        ('topics', topics),
-        ('nodes', nodes),
-        ('services', services),
-        ('robots', robots),
-        *(fields or {}).items(),
-    ):
-        check_names(name, value)
+    names = {'topic': topics, 'node': nodes, 'service': services, 'robot': robots}
+    for target, value in names.items():
+        check_names(f'{target}s', value)
+    for topic, paths in (fields or {}).items():
+        check_names(topic, paths)
     integer('max_faults', max_faults, 1)
     between(STEP, unit='s')('duration', duration)
-    targets = (
-        (TOPIC_KINDS, 'topic', topics),
-        (NODE_KINDS, 'node', nodes),
-        (SERVICE_KINDS, 'service', services),
-        (ROBOT_KINDS, 'robot', robots),
-        (WORLD_KINDS, '', ()),
-    )
     if kinds is None:
-        kinds = [kind for known, _, names in targets if names for kind in known]
-        kinds += WORLD_KINDS if clock else ()
+        affected = [*(target for target in names if names[target]), *(['clock'] if clock else [])]
+        kinds = [kind for target in affected for kind in KINDS[target]]
         if not kinds and not fields:
             raise ValueError('fault_schedules needs topics, nodes, services, robots, fields or kinds')
     strategies = []
@@ -443,16 +416,17 @@ def fault_schedules(
         if isinstance(kind, st.SearchStrategy):
             strategies.append(kind)
             continue
-        found = [(known[kind], field, names) for known, field, names in targets if kind in known]
-        if not found:
-            known_names = ', '.join(one.__name__ for known, _, _ in targets for one in known)
+        target = next((target for target, known in KINDS.items() if kind in known), '')
+        if not target:
+            known_names = ', '.join(one.__name__ for known in KINDS.values() for one in known)
             got = getattr(kind, '__name__', repr(kind))
             raise ValueError(f'kinds must be among {known_names}, or strategies of faults; got {got}')
-        own_fields, field, names = found[0]
-        if field and not names:
-            raise ValueError(f'{kind.__name__} needs {field}s')
-        target: Fields = {field: _one_of(names)} if field else {}
-        strategies.append(_of_kind(kind, {**target, **own_fields()}, duration, endless))
+        own = {}
+        if target in names:
+            if not names[target]:
+                raise ValueError(f'{kind.__name__} needs {target}s')
+            own = {target: _one_of(names[target])}
+        strategies.append(_of_kind(kind, {**own, **KINDS[target][kind]()}, duration, endless))
     for topic, paths in (fields or {}).items():
         for path in paths:
             strategies.append(_of_kind(faults.Corrupt, _corruption(topic, path), duration, endless))

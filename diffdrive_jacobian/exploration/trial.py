@@ -1,24 +1,38 @@
-"""One world: its case and its faults, how it is run, and what comes out."""
+"""One world: its case and its faults, how it is run, what comes out, and a hash of its messages."""
 
 from __future__ import annotations
 
+import hashlib
 import sys
 import sysconfig
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
+
 import diffdrive_jacobian
-from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.exploration.scenario import ScenarioName
 from diffdrive_jacobian.faults import Fault
 from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.messages.fields import is_identifier, plain, walk
+from diffdrive_jacobian.messages.structure import (
+    Array,
+    FieldType,
+    Number,
+    Sequence,
+    Structure,
+    structure,
+)
+from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.properties import Property, Watch
+from diffdrive_jacobian.ros.rclpy_internals import wrap_publish
 from diffdrive_jacobian.text import error_text, printable_lines
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -83,8 +97,6 @@ class Outcome:
     """In the order in which they happened."""
     checks: int = 0
     """How often a property was checked."""
-    events: int = 0
-    """How often faults acted."""
     seconds: float = 0.0
     """Duration in simulated time (s)."""
     complaints: tuple[str, ...] = ()
@@ -97,64 +109,45 @@ class Outcome:
         return next((one for one in self.violations if one.key == key), None)
 
 
-@dataclass
-class _Found:
-    """Collects the violations of a world."""
-
-    violations: list[Violation] = field(default_factory=list)
-    checks: int = 0
-    complaints: tuple[str, ...] = ()
-    stopping: bool = False
-    """Whether the world was ended because the violation that was looked for was found."""
-
-
 class _Collecting:
-    """Notes the first violation of a property, and lets the world go on."""
+    """A property whose first violation is collected, and ends the world only if `stop`."""
 
-    def __init__(self, watched: Property, index: int, found: _Found, *, stop: bool) -> None:
-        self.watched, self.index, self.found = watched, index, found
-        self.stop = stop
-        """Whether a violation ends the world."""
+    def __init__(self, watched: Property, index: int, found: list[Violation], *, stop: bool) -> None:
+        self._watched, self._index, self._found, self._stop = watched, index, found, stop
+        self._world: Any = None
+        self._watch: Watch | None = None
+        self.checks = 0
 
     def __repr__(self) -> str:
-        """Return that of the property."""
-        return repr(self.watched)
+        return repr(self._watched)
 
-    def watch(self, world: Any) -> _CollectingWatch:
-        """Return the watch."""
-        return _CollectingWatch(self, self.watched.watch(world), world)
-
-
-class _CollectingWatch:
-    def __init__(self, collecting: _Collecting, watch: Watch, world: Lockstep) -> None:
-        self._collecting, self._watch, self._world = collecting, watch, world
-        self._open = True
+    def watch(self, world: Any) -> _Collecting:
+        self._world, self._watch = world, self._watched.watch(world)
+        return self
 
     def check(self) -> str | None:
-        if not self._open:
+        if self._watch is None:
             return None
-        self._collecting.found.checks += 1
-        return self._note(self._watch.check())
+        self.checks += 1
+        return self._collected(self._watch.check())
 
     def finish(self) -> str | None:
-        return self._note(self._watch.finish()) if self._open else None
+        return None if self._watch is None else self._collected(self._watch.finish())
 
-    def _note(self, text: str | None) -> str | None:
+    def _collected(self, text: str | None) -> str | None:
         if text is None:
             return None
-        self._open = False
-        watched, found = self._collecting.watched, self._collecting.found
-        found.violations.append(
+        self._watch = None
+        self._found.append(
             Violation(
-                key=printable_lines(repr(watched)),
-                name=type(watched).__name__,
+                key=printable_lines(repr(self._watched)),
+                name=type(self._watched).__name__,
                 seconds=seconds(self._world),
                 text=printable_lines(text)[:LONGEST_TEXT],
-                index=self._collecting.index,
+                index=self._index,
             )
         )
-        found.stopping = self._collecting.stop
-        return text if found.stopping else None
+        return text if self._stop else None
 
 
 def seconds(world: Lockstep) -> float:
@@ -168,7 +161,7 @@ def run(
     *,
     only: int | None = None,
     digest: bool = False,
-    during: Any = None,
+    during: Callable[[Lockstep], AbstractContextManager[Any]] = nullcontext,
 ) -> Outcome:
     """Run one world.
 
@@ -178,84 +171,71 @@ def run(
         only: Index of the one property to check, whose violation ends the world; None: all of them,
             and the world goes on after a violation. -1: none, only exceptions count.
         digest: Whether to compute the hash of all messages.
-        during: `during(world)` returns a context manager, in which the scenario runs.
+        during: Returns a context manager in which the world is run.
 
     Raises:
         ExplorationError: The scenario cannot be imported.
         ValueError, LockstepError: A fault or a property is invalid in this world.
     """
     scenario = setting.scenario.load()
-    found = _Found()
+    violations: list[Violation] = []
+    complaints: tuple[str, ...] = ()
     properties = [
-        _Collecting(one, index, found, stop=only is not None)
+        _Collecting(one, index, violations, stop=only is not None)
         for index, one in enumerate(setting.properties)
         if only in (None, index)
     ]
-    arguments = list(setting.args) or ['--ros-args']
-    with Lockstep([*arguments, '--ros-args', *QUIET]) as world, ambient(during, world):
+    arguments = [*(setting.args or ['--ros-args']), '--ros-args', *QUIET]
+    with Lockstep(arguments) as world, during(world):
         hashed: AbstractContextManager[MessageDigest | None] = (
             MessageDigest(world) if digest else nullcontext()
         )
         with hashed as messages:
             world.inject(*trial.faults, seed=trial.seed)
             world.require(*properties)
-            _play(world, scenario, trial.case, found)
-            return Outcome(
-                violations=tuple(found.violations),
-                checks=found.checks,
-                events=len(world.fault_events),
-                seconds=seconds(world),
-                complaints=found.complaints,
-                digest='' if messages is None else messages.value(),
-            )
+            try:
+                scenario(world, trial.case)
+                complaints = _finish(world)
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:
+                # What ends the world because of `only` is collected already.
+                if not isinstance(getattr(error, 'property', None), _Collecting):
+                    violations.append(of_exception(error, world))
+        return Outcome(
+            violations=tuple(violations),
+            checks=sum(one.checks for one in properties),
+            seconds=seconds(world),
+            complaints=complaints,
+            digest='' if messages is None else messages.value(),
+        )
 
 
-@contextmanager
-def ambient(during: Any, world: Lockstep) -> Iterator[None]:
-    """Run the body in the context that `during` gives for the world."""
-    with nullcontext() if during is None else during(world):
-        yield
-
-
-def _play(world: Lockstep, scenario: Any, case: Any, found: _Found) -> None:
-    """Run the scenario to its end or its failure."""
-    try:
-        scenario(world, case)
-    except KeyboardInterrupt:
-        raise
-    except PropertyViolation:
-        if not found.stopping:
-            raise
-        return
-    except BaseException as error:
-        found.violations.append(of_exception(error, world))
-        return
-    _finish(world, found)
-
-
-def _finish(world: Lockstep, found: _Found) -> None:
-    """Check the properties at the end, and that faults and properties had something to do with."""
+def _finish(world: Lockstep) -> tuple[str, ...]:
+    """Check the properties at the end; return what faults and properties needed and did not find."""
     try:
         world.finish()
         world.check_faults()
     except PropertyViolation:
-        if not found.stopping:
-            raise
+        raise
     except IneffectiveFaultsError as error:
-        found.complaints = tuple(f'a fault had no effect: {reason}' for reason in error.reasons)
+        return tuple(f'a fault had no effect: {reason}' for reason in error.reasons)
     except LockstepError as error:
-        found.complaints = (str(error).partition('\n')[0],)
+        return (str(error).partition('\n')[0],)
+    return ()
 
 
 def of_exception(error: BaseException, world: Lockstep) -> Violation:
     """Return an exception of a node or of the scenario as a violation."""
     kind = type(error).__name__
-    place = _place(error.__traceback__)
+    key = f'{kind}{_place(error.__traceback__)}'
+    if isinstance(error, PropertyViolation):
+        key = repr(error.property)
     # The last messages of all topics may follow.
     first = error_text(error).strip().partition('\n')[0]
     text = ''.join(traceback.format_exception(type(error), error, error.__traceback__))
     return Violation(
-        key=printable_lines(f'{kind}{place}'),
+        key=printable_lines(key),
         name=f'NoException{kind}',
         seconds=seconds(world),
         text=printable_lines(text)[-LONGEST_TEXT:],
@@ -267,25 +247,83 @@ def _place(trace: TracebackType | None) -> str:
     """Return the innermost line of the user's code, or of this package if there is none."""
     frames = traceback.extract_tb(trace)
     own = [frame for frame in frames if not _is_library(frame.filename)]
-    chosen: Sequence[traceback.FrameSummary] = own or frames
-    if not chosen:
+    if not frames:
         return ''
-    last = chosen[-1]
+    last = (own or frames)[-1]
     return f' in {Path(last.filename).name}:{last.lineno} ({last.name})'
 
 
+_HERE = Path(diffdrive_jacobian.__file__).parent
 _LIBRARIES = tuple(
     str(Path(folder).resolve())
     for folder in (
-        sysconfig.get_path('stdlib'),
-        sysconfig.get_path('purelib'),
-        sysconfig.get_path('platlib'),
-        sys.prefix + '/lib',
-        Path(diffdrive_jacobian.__file__).parent / 'lockstep',
-        Path(diffdrive_jacobian.__file__).parent / 'exploration',
+        *map(sysconfig.get_path, ('stdlib', 'purelib', 'platlib')),
+        *(f'{sys.prefix}/lib', f'{_HERE}/lockstep', f'{_HERE}/exploration'),
     )
 )
 
 
 def _is_library(file: str) -> bool:
     return str(Path(file).resolve()).startswith(_LIBRARIES) or file.startswith('<')
+
+
+class MessageDigest:
+    """Hashes time, topic and fields of every message that a node publishes, as a context manager.
+
+    Two worlds with the same hash are the same bit for bit. Serialized bytes are not hashed as they are,
+    because their padding is arbitrary. Random identifiers of goals are replaced by their numbers in the
+    order in which they appear.
+    """
+
+    def __init__(self, world: Lockstep) -> None:
+        """Start without messages."""
+        self._world = world
+        self._hash = hashlib.sha256()
+        self._identifiers: dict[bytes, int] = {}
+
+    def __enter__(self) -> MessageDigest:
+        """Start to hash."""
+
+        def hashing(publish: Callable[..., None]) -> Callable[..., None]:
+            def hashed(publisher: Publisher, msg: Any) -> None:
+                publish(publisher, msg)
+                if publisher.topic_name not in NOT_OF_ROBOTS:
+                    self._add(publisher, msg)
+
+            return hashed
+
+        self._restore = wrap_publish(hashing)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop."""
+        self._restore()
+
+    def value(self) -> str:
+        """Return the hash of the messages so far."""
+        return self._hash.hexdigest()[:32]
+
+    def _add(self, publisher: Publisher, message: Any) -> None:
+        if isinstance(message, bytes):
+            message = deserialize_message(message, publisher.msg_type)
+        words = [str(self._world.now), publisher.topic_name]
+        for _, kind, value in walk(structure(type(message)), message, whole=is_identifier):
+            words += self._words(kind, value)
+        self._hash.update('\0'.join(words).encode())
+
+    def _words(self, kind: FieldType, value: Any) -> list[str]:
+        """Return a field of a message as text, with every bit of the numbers."""
+        match kind:
+            case Structure():
+                identifier = bytes(value.uuid)
+                number = self._identifiers.setdefault(identifier, len(self._identifiers))
+                return [str(number) if any(identifier) else 'none']
+            case Array() if hasattr(value, 'tobytes'):
+                return [value.tobytes().hex()]
+            case Array(element=element) | Sequence(element=element):
+                values = plain(value)
+                words = [word for one in values for word in self._words(element, one)]
+                return [str(len(values)), *words]
+            case Number() if isinstance(value, float):
+                return [value.hex()]
+        return [repr(value)]

@@ -12,14 +12,25 @@ A violation is raised as a `testing.PropertyViolation` by the method that advanc
 of your own, derive from `Property` and `Watch`.
 """
 
-from diffdrive_jacobian.properties._node_time import end_of_faults
-from diffdrive_jacobian.properties.arrival import ArrivesOnceFaultsEnd, KeepsDriving
 from diffdrive_jacobian.properties.base import Property, Watch
-from diffdrive_jacobian.properties.goals import NoCommandAfterCancel, NoStaleGoals, ReachesGoal, Settles
-from diffdrive_jacobian.properties.paths import StaysOnPath
-from diffdrive_jacobian.properties.places import PoseFinite, StaysNear, StaysWithin
-from diffdrive_jacobian.properties.protocol import StatusProtocol
-from diffdrive_jacobian.properties.speed import AccelerationWithin, NeverFasterThan
+from diffdrive_jacobian.properties.goals import (
+    ArrivesOnceFaultsEnd,
+    KeepsDriving,
+    NoCommandAfterCancel,
+    NoStaleGoals,
+    ReachesGoal,
+    Settles,
+    StatusProtocol,
+    end_of_faults,
+)
+from diffdrive_jacobian.properties.motion import (
+    AccelerationWithin,
+    NeverFasterThan,
+    PoseFinite,
+    StaysNear,
+    StaysOnPath,
+    StaysWithin,
+)
 from diffdrive_jacobian.properties.stopping import (
     StopsAfterLastCommand,
     StopsAfterLostOdometry,

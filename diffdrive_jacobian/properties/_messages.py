@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 from rclpy.serialization import deserialize_message
@@ -17,14 +18,11 @@ from diffdrive_jacobian.messages.structure import structure
 
 
 class Pose(NamedTuple):
-    """A pose in the plane."""
+    """A pose in the plane (m, m, rad), theta from -pi to pi."""
 
     x: float
-    """(m)"""
     y: float
-    """(m)"""
     theta: float
-    """(rad), from -pi to pi."""
 
     def __str__(self) -> str:
         return f'x {self.x:.6g} m, y {self.y:.6g} m, theta {self.theta:.6g} rad'
@@ -35,12 +33,10 @@ class Pose(NamedTuple):
 
 
 class Twist(NamedTuple):
-    """A body twist."""
+    """A body twist (m/s, rad/s)."""
 
     v: float
-    """(m/s)"""
     omega: float
-    """(rad/s)"""
 
     def __str__(self) -> str:
         return f'v {self.v:.6g} m/s, omega {self.omega:.6g} rad/s'
@@ -50,41 +46,46 @@ class Twist(NamedTuple):
         """Whether both are zero."""
         return self.v == 0.0 and self.omega == 0.0
 
+    def is_within(self, v: float, omega: float) -> bool:
+        """Whether neither is larger than a limit. NaN is not."""
+        return abs(self.v) <= v and abs(self.omega) <= omega
 
-class FieldReader:
-    """Reads fields of messages, which are objects or serialized.
 
-    Several properties read the same message one after the other, so the last serialized one is
-    remembered.
+Read = Callable[[type, Any], tuple[Any, ...] | None]
+
+
+def field_reader(fields_of: Callable[[type], tuple[str, ...]]) -> Read:
+    """Return a function that reads fields of a message, from its type and its object or its bytes.
+
+    It returns None if the bytes are not a message of the type.
+
+    Args:
+        fields_of: Returns the paths of the fields of a type of messages.
     """
 
-    def __init__(self, fields_of: Callable[[type], tuple[str, ...]]) -> None:
-        """Start without a type. `fields_of` returns the paths of the fields of a type of messages."""
-        self._fields_of = fields_of
-        self._readers: dict[type, tuple[tuple[str, ...], Reader]] = {}
-        self._last: tuple[type, bytes, tuple[Any, ...] | None] | None = None
+    @cache
+    def compiled(message_type: type) -> tuple[tuple[str, ...], Reader]:
+        fields = fields_of(message_type)
+        return fields, Reader(message_type, fields, deserialize=deserialize_message)
 
-    def read(self, message_type: type, message: Any) -> tuple[Any, ...] | None:
-        """Return the fields. None: the bytes are not a message of this type."""
-        last = self._last
-        if last is not None and last[1] is message and last[0] is message_type:
-            return last[2]
-        if message_type not in self._readers:
-            fields = self._fields_of(message_type)
-            reader = Reader(message_type, fields, deserialize=deserialize_message)
-            self._readers[message_type] = fields, reader
-        fields, read = self._readers[message_type]
-        if not isinstance(message, bytes):
-            return tuple(field_value(message, field) for field in fields)
-        values: tuple[Any, ...] | None = None
+    # Several properties read the same message one after the other.
+    @lru_cache(1)
+    def read_bytes(message_type: type, message: bytes) -> tuple[Any, ...] | None:
         with suppress(DecodingError):
-            values = read(message)
-        self._last = message_type, message, values
-        return values
+            return compiled(message_type)[1](message)
+        return None
+
+    def read(message_type: type, message: Any) -> tuple[Any, ...] | None:
+        fields, _ = compiled(message_type)
+        if isinstance(message, bytes):
+            return read_bytes(message_type, message)
+        return tuple(field_value(message, field) for field in fields)
+
+    return read
 
 
-_read_twist = FieldReader(lambda kind: twist_fields(_known(kind, TWIST_IN, 'twist'))).read
-_read_pose = FieldReader(lambda kind: pose_fields(_known(kind, POSE_IN, 'pose'))).read
+_read_twist = field_reader(lambda kind: twist_fields(_known(kind, TWIST_IN, 'twist')))
+_read_pose = field_reader(lambda kind: pose_fields(_known(kind, POSE_IN, 'pose')))
 
 
 def read_twist(message_type: type, message: Any) -> Twist | None:

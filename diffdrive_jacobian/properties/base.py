@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -12,11 +14,14 @@ from rclpy.publisher import Publisher
 from diffdrive_jacobian.faults.fault import Expression
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.names import full_name
-from diffdrive_jacobian.numerics.fields import Text
+from diffdrive_jacobian.numerics.fields import Name, Text
+from diffdrive_jacobian.properties._messages import Pose, Twist, read_pose, read_twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 RECENT = 5
 """Number of messages that a violation lists."""
+ROUNDING = 1e-9
+"""Tolerance on times (s) and distances (m)."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -104,3 +109,65 @@ class Watch:
             f'  {time / NANOSECONDS:.9g} s: {"".join(map(str, parts))}' for time, parts in self._recent
         ]
         return '\n'.join([text, *(['before that:'] if notes else []), *notes])
+
+
+P = TypeVar('P', bound=Property)
+
+
+class PropertyWatch(Watch, Generic[P]):
+    """A watch that knows its property, and observes the topics that this names."""
+
+    def __init__(self, required: P, world: Lockstep) -> None:
+        """Observe a run."""
+        super().__init__(world)
+        self.required = required
+
+    def on_published(self, topic: str, observe: Callable[[Publisher, Any], None]) -> str:
+        """Observe a topic, which some node must offer. Return its full name."""
+        self.world.expect(self.required.resolved(topic))
+        return self.world.on_published(self.required.resolved(topic), observe)
+
+    def on_delivered(self, topic: str, observe: Callable[[Node, Any, Any], None]) -> str:
+        """Observe what is received of a topic, which some node must offer. Return its full name."""
+        self.world.expect(self.required.resolved(topic))
+        return self.world.on_delivered(self.required.resolved(topic), observe)
+
+
+@dataclass(frozen=True, repr=False)
+class MotionProperty(Property):
+    """A property of the motion in the odometry. Base class.
+
+    Attributes:
+        odom: Topic of type Odometry (default: 'odom'). 'ground_truth' for the true pose of a virtual
+            robot that drifts.
+    """
+
+    odom: Name = field(default='odom', kw_only=True)
+
+
+M = TypeVar('M', bound=MotionProperty)
+
+
+class MotionWatch(PropertyWatch[M]):
+    """A watch of the last pose and twist in the odometry."""
+
+    def __init__(self, required: M, world: Lockstep) -> None:
+        """Observe a run."""
+        super().__init__(required, world)
+        self.pose: Pose | None = None
+        self.twist: Twist | None = None
+        self.odom = self.on_published(required.odom, self._on_odometry)
+
+    def _on_odometry(self, publisher: Publisher, message: Any) -> None:
+        self.pose = read_pose(publisher.msg_type, message)
+        self.twist = read_twist(publisher.msg_type, message)
+        if self.pose is None or self.twist is None:
+            self.on_invalid()
+        else:
+            self.on_motion(self.pose, self.twist)
+
+    def on_motion(self, pose: Pose, twist: Twist) -> None:
+        """Receive a message of the odometry."""
+
+    def on_invalid(self) -> None:
+        """Receive bytes that are no Odometry."""

@@ -1,31 +1,30 @@
-"""Reaching goals."""
+"""Goals: reaching them, their status, canceling, and arriving once the faults have ended."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, Status
-from diffdrive_jacobian.messages.goal_follower import UNSTAMPED, Stamp
-from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, STAMP, Status
+from diffdrive_jacobian.messages.goal_follower import UNSTAMPED, FollowedGoal, GoalFollower, Stamp
+from diffdrive_jacobian.messages.goal_status import FOLLOWING, GoalState
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name, Names
-from diffdrive_jacobian.properties._messages import (
-    FieldReader,
-    Pose,
-    Twist,
-    planar,
-    read_pose,
-    read_twist,
+from diffdrive_jacobian.properties._messages import Pose, Twist, field_reader, planar, read_twist
+from diffdrive_jacobian.properties.base import (
+    ROUNDING,
+    MotionProperty,
+    MotionWatch,
+    Property,
+    PropertyWatch,
+    Watch,
 )
-from diffdrive_jacobian.properties._node_time import ROUNDING
-from diffdrive_jacobian.properties.base import Property, Watch
 
 STANDING = Twist(0.01, 0.05)
 """Largest twist of a robot that counts as standing."""
@@ -37,11 +36,14 @@ class SentGoal(NamedTuple):
     pose: Pose
     seconds: float
     """World time at which it was sent or received (s)."""
-    stamp: tuple[int, int]
-    """Stamp of its message: sec and nanosec."""
+    stamp: Stamp
+    """Stamp of its message."""
 
 
-_read_goal = FieldReader(lambda kind: GOALS.fields if kind.__name__ == 'Goals' else POSE.fields).read
+_read_goal = field_reader(lambda kind: GOALS.fields if kind.__name__ == 'Goals' else POSE.fields)
+_read_status = field_reader(lambda _: GOAL_STATUS.fields)
+_read_stamp = field_reader(lambda _: STAMP)
+_read_identifier = field_reader(lambda _: ('goal_info.goal_id.uuid',))
 
 
 def read_goal(message_type: type, message: Any, seconds: float) -> SentGoal | None:
@@ -58,62 +60,70 @@ def read_goal(message_type: type, message: Any, seconds: float) -> SentGoal | No
     return SentGoal(planar(*pose), seconds, (int(sec), int(nanosec)))
 
 
-_read_status = FieldReader(lambda _: GOAL_STATUS.fields).read
-
-
 def read_status(message_type: type, message: Any) -> Status | None:
     """Return the status in a GoalStatus; None: the bytes are invalid."""
     fields = _read_status(message_type, message)
     return None if fields is None else GOAL_STATUS.value(*map(int, fields))
 
 
-class Motion:
-    """The last pose and twist in the odometry of a robot."""
+def _text(stamp: Stamp) -> str:
+    return f'the goal with stamp {stamp[0]}.{stamp[1]:09d} s'
 
-    def __init__(self, world: Lockstep, topic: str, changed: Callable[[Pose, Twist], None]) -> None:
-        """Observe a topic of odometry. `changed` is called with each pose and its twist."""
-        self.pose: Pose | None = None
-        self.twist: Twist | None = None
-        self._changed = changed
-        world.expect(topic)
-        self.topic = world.on_published(topic, self._on_odometry)
 
-    def _on_odometry(self, publisher: Publisher, message: Any) -> None:
-        self.pose = read_pose(publisher.msg_type, message)
-        self.twist = read_twist(publisher.msg_type, message)
-        if self.pose is not None and self.twist is not None:
-            self._changed(self.pose, self.twist)
+@dataclass(frozen=True, repr=False)
+class GoalProperty(MotionProperty):
+    """A property of the way to goals. Base class.
+
+    Attributes:
+        goals: Topics of the goals, of type PoseStamped or Goals, of which the last one counts (default:
+            ('goal_pose', 'goals')).
+        cancel: Service that cancels the goal (default: 'cancel_goal').
+    """
+
+    goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
+    cancel: Name = field(default='cancel_goal', kw_only=True)
+
+
+G = TypeVar('G', bound=GoalProperty)
+
+
+class _GoalWatch(MotionWatch[G]):
+    """Observes the way to a goal."""
 
     @property
     def stands(self) -> bool:
         """Whether the robot stands still."""
-        twist = self.twist
-        return twist is not None and (abs(twist.v) <= STANDING.v and abs(twist.omega) <= STANDING.omega)
+        return self.twist is not None and self.twist.is_within(*STANDING)
 
-    def where(self, goal: SentGoal | None, of: str = '') -> str:
-        """Return where the robot is, relative to a goal, `of` what."""
-        if self.pose is None or goal is None:
-            return f'there was no odometry on {self.topic}'
+    def where(self, goal: SentGoal, of: str = '') -> str:
+        """Return where the robot is, relative to a goal `of` a controller."""
+        if self.pose is None:
+            return f'there was no odometry on {self.odom}'
         distance = self.pose.distance(goal.pose)
         return (
             f'the robot is {distance:.6g} m from the goal{of} at {goal.pose}: {self.pose}, {self.twist}'
         )
 
 
-@dataclass(frozen=True, repr=False)
-class GoalProperty(Property):
-    """A property of the way to goals. Base class.
+class _PublishedGoalWatch(_GoalWatch[G]):
+    """Observes the last goal that was published, while it is due."""
 
-    Attributes:
-        goals: Topics of the goals, of type PoseStamped or Goals, of which the last one counts (default:
-            ('goal_pose', 'goals')).
-        odom: Topic of the odometry (default: 'odom').
-        cancel: Service that cancels the goal (default: 'cancel_goal').
-    """
+    def __init__(self, required: G, world: Lockstep) -> None:
+        super().__init__(required, world)
+        self.goal: SentGoal | None = None
+        world.expect(*map(required.resolved, required.goals))
+        for topic in required.goals:
+            world.on_published(required.resolved(topic), self._on_goal)
+        world.on_response(required.resolved(required.cancel), self._on_cancel)
 
-    goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
-    odom: Name = field(default='odom', kw_only=True)
-    cancel: Name = field(default='cancel_goal', kw_only=True)
+    def _on_goal(self, publisher: Publisher, message: Any) -> None:
+        self.goal = read_goal(publisher.msg_type, message, self.seconds)
+        if self.goal is not None:
+            self.note(f'{publisher.topic_name}: goal at {self.goal.pose}')
+
+    def _on_cancel(self, _: Node, __: Any) -> None:
+        self.goal = None
+        self.note('canceled')
 
 
 @dataclass(frozen=True, repr=False)
@@ -140,75 +150,35 @@ class ReachesGoal(GoalProperty):
         return _ReachesWatch(self, world)
 
 
-class _PublishedGoalWatch(Watch):
-    """Observes the goals as they are published."""
-
-    def __init__(self, required: GoalProperty, world: Lockstep) -> None:
-        super().__init__(world)
-        self.goal: SentGoal | None = None
-        world.expect(*map(required.resolved, required.goals))
-        for topic in required.goals:
-            world.on_published(required.resolved(topic), self._on_goal)
-        self.motion = Motion(world, required.resolved(required.odom), self.on_motion)
-        world.on_response(required.resolved(required.cancel), self._on_cancel)
-
-    def _on_goal(self, publisher: Publisher, message: Any) -> None:
-        self.goal = read_goal(publisher.msg_type, message, self.seconds)
-        if self.goal is not None:
-            self.note(f'{publisher.topic_name}: goal at {self.goal.pose}')
-
-    def _on_cancel(self, _: Any, __: Any) -> None:
-        self.goal = None
-        self.note('canceled')
-
+class _ReachesWatch(_PublishedGoalWatch[ReachesGoal]):
     def on_motion(self, pose: Pose, twist: Twist) -> None:
-        """Receive a pose and twist of the odometry."""
-
-    def where(self) -> str:
-        """Return where the robot is, relative to the goal."""
-        return self.motion.where(self.goal)
-
-
-class _ReachesWatch(_PublishedGoalWatch):
-    def __init__(self, required: ReachesGoal, world: Lockstep) -> None:
-        self._required = required
-        super().__init__(required, world)
-
-    def on_motion(self, pose: Pose, twist: Twist) -> None:
-        """Note whether the robot stands at the goal."""
-        required, goal = self._required, self.goal
+        required, goal = self.required, self.goal
         if (
             goal is not None
-            and self.motion.stands
+            and self.stands
             and pose.distance(goal.pose) <= required.tolerance
             and abs(math.remainder(pose.theta - goal.pose.theta, math.tau)) <= required.yaw_tolerance
         ):
-            self._check()
+            self.check()
             self.goal = None
 
-    def _check(self) -> None:
-        goal, within = self.goal, self._required.within
-        if goal is not None and self.seconds - goal.seconds > within + ROUNDING:
-            self.found(
-                f'{within:g} s after the goal was published {self.where()}; allowed: {self._at()}'
-            )
-
-    def _at(self) -> str:
-        return f'within {self._required.tolerance:g} m and standing'
-
     def check(self) -> str | None:
-        """Return that a goal was not reached in time; None: it was."""
-        self._check()
-        return self._found
+        goal, required = self.goal, self.required
+        if goal is not None and self.seconds - goal.seconds > required.within + ROUNDING:
+            self.found(
+                f'{required.within:g} s after the goal was published {self.where(goal)}; allowed: '
+                f'within {required.tolerance:g} m and standing'
+            )
+        return super().check()
 
     def finish(self) -> str | None:
-        """Return that a goal was not reached yet; None: there is no such goal."""
-        if self.goal is None:
+        goal, required = self.goal, self.required
+        if goal is None:
             return None
-        passed = self.seconds - self.goal.seconds
         return self.described(
-            f'the run ended {passed:g} s after the goal was published, and {self.where()}; allowed: '
-            f'{self._at()}. Let it run for {self._required.within:g} s after the goal'
+            f'the run ended {self.seconds - goal.seconds:g} s after the goal was published, and '
+            f'{self.where(goal)}; allowed: within {required.tolerance:g} m and standing. Let it run for '
+            f'{required.within:g} s after the goal'
         )
 
 
@@ -233,37 +203,206 @@ class Settles(GoalProperty):
         return _SettlesWatch(self, world)
 
 
-class _SettlesWatch(_PublishedGoalWatch):
-    def __init__(self, required: Settles, world: Lockstep) -> None:
-        self._required = required
-        super().__init__(required, world)
-
+class _SettlesWatch(_PublishedGoalWatch[Settles]):
     def on_motion(self, pose: Pose, twist: Twist) -> None:
-        """Check the distance to the goal."""
-        if self.goal is None or self.seconds - self.goal.seconds <= self._required.within + ROUNDING:
+        goal, required = self.goal, self.required
+        if goal is None or self.seconds - goal.seconds <= required.within + ROUNDING:
             return
-        if not pose.distance(self.goal.pose) <= self._required.tolerance:
-            self._late()
-
-    def _late(self) -> None:
-        if self.goal is not None:
+        if not pose.distance(goal.pose) <= required.tolerance:
             self.found(
-                f'{self.seconds - self.goal.seconds:g} s after the goal was published {self.where()}; '
-                f'allowed: {self._required.tolerance:g} m'
+                f'{self.seconds - goal.seconds:g} s after the goal was published {self.where(goal)}; '
+                f'allowed: {required.tolerance:g} m'
             )
 
     def finish(self) -> str | None:
-        """Return that there was no odometry after the settling time; None: there was."""
-        if self.goal is None:
+        goal, within = self.goal, self.required.within
+        if goal is None:
             return None
-        passed = self.seconds - self.goal.seconds
-        if passed < self._required.within - ROUNDING or self.motion.pose is None:
+        passed = self.seconds - goal.seconds
+        if passed < within - ROUNDING or self.pose is None:
             return self.described(
-                f'the run ended {passed:g} s after the goal was published, and {self.where()}. Let it '
-                f'run for {self._required.within:g} s after the goal'
+                f'the run ended {passed:g} s after the goal was published, and {self.where(goal)}. Let '
+                f'it run for {within:g} s after the goal'
             )
-        self.on_motion(self.motion.pose, Twist(0.0, 0.0))
+        # That of the last message, which may have come before.
+        self.on_motion(self.pose, STANDING)
         return self._found
+
+
+# --- Arriving once the faults have ended
+
+
+def end_of_faults(world: Lockstep) -> float:
+    """Return the world time at which all faults have ended, and what they delayed has arrived (s).
+
+    Infinite: one of them has no end. Faults of one topic may delay a message one after the other.
+    """
+    end = max((fault.end for fault in world.faults), default=0.0)
+    return float(end + sum(fault.longest_delay for fault in world.faults))
+
+
+@dataclass(frozen=True, repr=False)
+class DueGoalProperty(GoalProperty):
+    """A property of the goals that a controller has received. Base class.
+
+    A controller is a node that is subscribed to a topic of `goals` and publishes `commands`. It has the
+    goal that it received last. That is due until the robot has stood within `tolerance` of it, or
+
+    - the cancel service of the node has responded,
+    - the node has published CANCELED or ABORTED for it (with the stamp of the goal) on `status`,
+    - the node was removed, killed or shut down.
+
+    While there is a fault without an end nothing is due. Time is world time. The faults have ended when
+    what they delayed has arrived, too (`end_of_faults`).
+
+    Attributes:
+        within: Longest time (s).
+        tolerance: Largest distance to the goal (m) (default: 0.05).
+        status: Topic of type action_msgs/GoalStatus (default: 'goal_status').
+        commands: Topic on which the controller publishes (default: 'cmd_vel').
+    """
+
+    within: NotNegative
+    tolerance: PositiveOrInfinite = field(default=0.05, kw_only=True)
+    status: Name = field(default='goal_status', kw_only=True)
+    commands: Name = field(default='cmd_vel', kw_only=True)
+
+
+@dataclass(frozen=True, repr=False)
+class ArrivesOnceFaultsEnd(DueGoalProperty):
+    """The robot arrives at the goal that its controller has received, once the faults have ended.
+
+    A goal must not be due (`DueGoalProperty`) later than `within` after the controller has received it
+    and the last fault has ended. A run that ends before the goal is reached violates the property: let
+    it run longer.
+    """
+
+    def watch(self, world: Lockstep) -> Watch:
+        """Begin to observe a run."""
+        return _ArrivesWatch(self, world)
+
+
+@dataclass(frozen=True, repr=False)
+class KeepsDriving(DueGoalProperty):
+    """The robot does not stand still on its way, once the faults have ended.
+
+    While a goal is due (`DueGoalProperty`) the robot must not stand for longer than `within`, beginning
+    when the controller has received the goal and the last fault has ended. It stands while the twists in
+    its odometry are at most 0.01 m/s and 0.05 rad/s.
+    """
+
+    def watch(self, world: Lockstep) -> Watch:
+        """Begin to observe a run."""
+        return _KeepsDrivingWatch(self, world)
+
+
+class _Due(NamedTuple):
+    """A goal that is due."""
+
+    node: Node
+    """Its controller."""
+    goal: SentGoal
+    begin: float
+    """World time at which the time for it begins (s)."""
+    event: str
+    """What happened then."""
+
+
+class _DueGoalWatch(_GoalWatch[DueGoalProperty]):
+    def __init__(self, required: DueGoalProperty, world: Lockstep) -> None:
+        super().__init__(required, world)
+        self._followers: defaultdict[Node, GoalFollower[SentGoal]] = defaultdict(GoalFollower)
+        self._received: dict[Node, FollowedGoal[SentGoal]] = {}
+        self.moved = self.seconds
+        world.expect(*map(required.resolved, required.goals))
+        for topic in required.goals:
+            world.on_delivered(required.resolved(topic), self._on_goal)
+        self._commands = world.node.resolve_topic_name(required.resolved(required.commands))
+        world.expect(self._commands)
+        world.on_published(required.resolved(required.status), self._on_status)
+        world.on_response(required.resolved(required.cancel), self._on_cancel)
+
+    def _on_goal(self, node: Node, message_type: type, message: Any) -> None:
+        goal = read_goal(message_type, message, self.seconds)
+        if goal is None or not any(one.topic_name == self._commands for one in node.publishers):
+            return
+        self._received[node] = self._followers[node].sent(goal, goal.stamp)
+        self.note(f'{self.name_of(node)} received a goal at {goal.pose}')
+
+    def _on_cancel(self, node: Node, _: Any) -> None:
+        if self._received.pop(node, None) is not None:
+            self.note('canceled')
+
+    def _on_status(self, publisher: Publisher, message: Any) -> None:
+        node, status = self.world.node_of(publisher), read_status(publisher.msg_type, message)
+        if node is not None and status is not None:
+            self._followers[node].reported(status.status, status.stamp)
+
+    def on_motion(self, pose: Pose, _: Twist) -> None:
+        if not self.stands:
+            self.moved = self.seconds
+            return
+        for due in self.due():
+            if pose.distance(due.goal.pose) <= self.required.tolerance:
+                # Steps of time may be long: this may be too late.
+                self.check()
+                del self._received[due.node]
+
+    def due(self) -> list[_Due]:
+        """Return the goals that are due."""
+        if not self._received:
+            return []
+        nodes, end = self.world.nodes, end_of_faults(self.world)
+        return [
+            _Due(node, goal, end, 'the faults have ended')
+            if end > goal.seconds
+            else _Due(node, goal, goal.seconds, 'the goal was received')
+            for node, followed in self._received.items()
+            if (goal := followed.goal) is not None
+            and followed.state not in (GoalState.CANCELED, GoalState.ABORTED)
+            and node in nodes
+        ]
+
+    def where_of(self, due: _Due) -> str:
+        """Return where the robot is, relative to a goal."""
+        return self.where(due.goal, f' of {self.name_of(due.node)}')
+
+
+class _ArrivesWatch(_DueGoalWatch):
+    def check(self) -> str | None:
+        for due in self.due():
+            passed = self.seconds - due.begin
+            if passed > self.required.within + ROUNDING:
+                self.found(
+                    f'{passed:g} s after {due.event} {self.where_of(due)}; allowed: '
+                    f'within {self.required.tolerance:g} m and standing'
+                )
+        return super().check()
+
+    def finish(self) -> str | None:
+        for due in self.due():
+            if math.isfinite(due.begin):
+                return self.described(
+                    f'the run ended {self.seconds - due.begin:g} s after {due.event}: '
+                    f'{self.where_of(due)}; allowed: within {self.required.tolerance:g} m and standing. '
+                    f'Let it run for {self.required.within:g} s after that'
+                )
+        return None
+
+
+class _KeepsDrivingWatch(_DueGoalWatch):
+    def check(self) -> str | None:
+        for due in self.due():
+            stood = self.seconds - max(due.begin, self.moved)
+            if stood > self.required.within + ROUNDING:
+                self.found(
+                    f'{self.seconds - due.begin:g} s after {due.event} the robot has stood for '
+                    f'{stood:g} s, and {self.where_of(due)}; allowed: {self.required.within:g} s'
+                )
+        return super().check()
+
+
+# --- Canceling
 
 
 @dataclass(frozen=True, repr=False)
@@ -288,15 +427,14 @@ class NoCommandAfterCancel(Property):
         return _CancelWatch(self, world)
 
 
-class _CancelWatch(Watch):
+class _CancelWatch(PropertyWatch[NoCommandAfterCancel]):
     def __init__(self, required: NoCommandAfterCancel, world: Lockstep) -> None:
-        super().__init__(world)
+        super().__init__(required, world)
         self._canceled: dict[Node, float] = {}
-        world.expect(required.resolved(required.commands))
-        world.expect(required.resolved(required.cancel))
-        self._commands = world.on_published(required.resolved(required.commands), self._on_command)
+        self._commands = self.on_published(required.commands, self._on_command)
         for topic in required.goals:
             world.on_delivered(required.resolved(topic), self._on_goal)
+        world.expect(required.resolved(required.cancel))
         self._cancel = world.on_response(required.resolved(required.cancel), self._on_cancel)
 
     def _on_goal(self, node: Node, _: type, __: Any) -> None:
@@ -321,6 +459,9 @@ class _CancelWatch(Watch):
         self.note(self._commands, ': ', twist)
 
 
+# --- Status
+
+
 @dataclass(frozen=True, repr=False)
 class NoStaleGoals(Property):
     """A controller accepts no goal that is older than one that it has accepted, and none twice.
@@ -343,38 +484,134 @@ class NoStaleGoals(Property):
         return _StaleGoalWatch(self, world)
 
 
-class _StaleGoalWatch(Watch):
+class _StaleGoalWatch(PropertyWatch[NoStaleGoals]):
     def __init__(self, required: NoStaleGoals, world: Lockstep) -> None:
-        super().__init__(world)
+        super().__init__(required, world)
         self._newest: dict[Publisher, Stamp] = {}
         self._clock = world.now
-        world.expect(required.resolved(required.topic))
-        self._topic = world.on_published(required.resolved(required.topic), self._on_status)
+        self._topic = self.on_published(required.topic, self._on_status)
 
     def _on_status(self, publisher: Publisher, message: Any) -> None:
         status = read_status(publisher.msg_type, message)
         if status is None or status.status != GoalState.ACCEPTED or status.stamp == UNSTAMPED:
             return
-        self._follow_clock()
+        self.check()
         stamp, newest = status.stamp, self._newest.get(publisher, UNSTAMPED)
         if stamp <= newest:
             self.found(
-                f'{self._topic}: ACCEPTED of the goal with stamp {_text(stamp)} s, after one with stamp '
-                f'{_text(newest)} s; allowed: newer stamps'
+                f'{self._topic}: ACCEPTED of {_text(stamp)}, after one with stamp '
+                f'{newest[0]}.{newest[1]:09d} s; allowed: newer stamps'
             )
         self._newest[publisher] = stamp
-        self.note(f'{self._topic}: ACCEPTED of the goal with stamp {_text(stamp)} s')
+        self.note(f'{self._topic}: ACCEPTED of {_text(stamp)}')
 
     def check(self) -> str | None:
-        """Return that an old goal was accepted; None: none was."""
-        self._follow_clock()
-        return self._found
-
-    def _follow_clock(self) -> None:
         if self.world.now < self._clock:
             self._newest.clear()
         self._clock = self.world.now
+        return super().check()
 
 
-def _text(stamp: Stamp) -> str:
-    return f'{stamp[0]}.{stamp[1]:09d}'
+@dataclass(frozen=True, repr=False)
+class StatusProtocol(Property):
+    """The status of each goal goes its way: ACCEPTED, EXECUTING, then one terminal status, and no more.
+
+    - The first status of a goal is ACCEPTED, or ABORTED if it is refused.
+    - ACCEPTED is followed by EXECUTING, CANCELING, CANCELED or ABORTED, EXECUTING by CANCELING or a
+      terminal status. Only ACCEPTED, EXECUTING and CANCELING may be repeated.
+    - After a terminal status (SUCCEEDED, CANCELED, ABORTED) there is no other, not even the same again.
+    - One goal at a time is active: before the next one is ACCEPTED the previous one has its terminal
+      status.
+
+    Goals are told apart by the identifier and the stamp in `goal_info`. A controller that leaves the
+    identifier at zeros may accept a stamp again when it receives a goal with this stamp again. A goal
+    need not become terminal. Each publisher is checked on its own, so a node that was restarted starts
+    afresh.
+
+    Attributes:
+        topic: Topic of type action_msgs/GoalStatus (default: 'goal_status').
+        goals: Topics of the goals (default: ('goal_pose', 'goals')).
+    """
+
+    topic: Name = field(default='goal_status', kw_only=True)
+    goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
+
+    def watch(self, world: Lockstep) -> Watch:
+        """Begin to observe a run."""
+        return _StatusWatch(self, world)
+
+
+class _Goal(NamedTuple):
+    """A goal as one publisher names it."""
+
+    publisher: Publisher
+    uuid: bytes
+    stamp: Stamp
+
+    def __str__(self) -> str:
+        named = f' and identifier {self.uuid.hex()[:8]}...' if any(self.uuid) else ''
+        return _text(self.stamp) + named
+
+
+class _StatusWatch(PropertyWatch[StatusProtocol]):
+    def __init__(self, required: StatusProtocol, world: Lockstep) -> None:
+        super().__init__(required, world)
+        self._last: dict[_Goal, GoalState] = {}
+        self._active: dict[Publisher, _Goal] = {}
+        self._received: Counter[tuple[Node, Stamp]] = Counter()
+        self._answered: Counter[_Goal] = Counter()
+        self._topic = self.on_published(required.topic, self._on_status)
+        for goals in required.goals:
+            world.on_delivered(required.resolved(goals), self._on_goal)
+
+    def _on_goal(self, node: Node, message_type: type, message: Any) -> None:
+        stamp = _read_stamp(message_type, message)
+        if stamp is not None:
+            self._received[node, (int(stamp[0]), int(stamp[1]))] += 1
+
+    def _on_status(self, publisher: Publisher, message: Any) -> None:
+        status = read_status(publisher.msg_type, message)
+        identifier = _read_identifier(publisher.msg_type, message)
+        if status is None or identifier is None:
+            self.found(f'{self._topic}: bytes that are no GoalStatus')
+            return
+        goal = _Goal(publisher, bytes(identifier[0]), status.stamp)
+        known = status.status in FOLLOWING and status.status != GoalState.UNKNOWN
+        what = f'{GoalState(status.status).name if known else status.status} of {goal}'
+        self._check(goal, status.status, what)
+        if known:
+            self._check_active(goal, GoalState(status.status), what)
+        self.note(self._topic, ': ', what)
+
+    def _check(self, goal: _Goal, status: int, what: str) -> None:
+        """Check what a status follows."""
+        last = self._last.get(goal, GoalState.UNKNOWN)
+        received = self._received[self.world.node_of(goal.publisher), goal.stamp]
+        # A goal without an identifier may be received again after its terminal status.
+        if last.ended and not any(goal.uuid) and received > self._answered[goal]:
+            last = GoalState.UNKNOWN
+        if last is GoalState.UNKNOWN:
+            self._answered[goal] = min(self._answered[goal] + 1, received)
+        if last.ended:
+            self.found(
+                f'{self._topic}: {what}, which was {last.name} already; allowed: nothing after that'
+            )
+        elif status not in FOLLOWING[last]:
+            before = f'after {last.name}' if last else 'as its first status'
+            allowed = ', '.join(one.name for one in FOLLOWING[last])
+            self.found(f'{self._topic}: {what} {before}; allowed: {allowed}')
+
+    def _check_active(self, goal: _Goal, status: GoalState, what: str) -> None:
+        """Check that one goal at a time is active."""
+        active = self._active.get(goal.publisher)
+        if status.ended:
+            if active == goal:
+                del self._active[goal.publisher]
+        elif active not in (None, goal) and status is GoalState.ACCEPTED:
+            self.found(
+                f'{self._topic}: {what}, while the goal before is {self._last[active].name}; allowed: '
+                'after its terminal status'
+            )
+        if not status.ended:
+            self._active[goal.publisher] = goal
+        self._last[goal] = status

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -12,19 +13,19 @@ from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.numerics.checks import NotNegative
 from diffdrive_jacobian.numerics.fields import Name, Text
 from diffdrive_jacobian.properties._messages import Twist, read_twist
-from diffdrive_jacobian.properties._node_time import ROUNDING, ReactionTime, delays
-from diffdrive_jacobian.properties.base import Property, Watch
+from diffdrive_jacobian.properties.base import (
+    ROUNDING,
+    MotionProperty,
+    Property,
+    PropertyWatch,
+    Watch,
+)
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 
 @dataclass(frozen=True, repr=False)
-class StopsAfterLostOdometry(Property):
-    """A controller stops the robot within a time after it has received its last odometry.
-
-    A controller is a node that publishes `commands` and is subscribed to `odom`, other than that of the
-    test. What counts is the odometry that it receives, after all faults of the topic, and the command
-    that it has published last, whether or not that arrives: longer than `within` after the last odometry
-    it must be zero. Before its first odometry the time counts from its first command. Nodes that were
-    removed or killed cannot stop anything, and are not checked.
+class ReactionProperty(MotionProperty):
+    """A property of a node that does not receive messages any more. Base class.
 
     The time is what a timer of the node can measure. It does not pass while the clock of the nodes
     stands still or the node is frozen (`Hang`), it starts again where the clock jumps, and it is longer
@@ -32,114 +33,155 @@ class StopsAfterLostOdometry(Property):
 
     Attributes:
         within: Longest time (s).
-        node: Name of the controller (default: all).
-        odom: Topic of the odometry (default: 'odom').
-        commands: Topic of type Twist or TwistStamped (default: 'cmd_vel').
+        node: Name of the node (default: all).
+        commands: Topic of the commands (default: 'cmd_vel').
     """
 
     within: NotNegative
     node: Text = field(default='', kw_only=True)
-    odom: Name = field(default='odom', kw_only=True)
     commands: Name = field(default='cmd_vel', kw_only=True)
+
+
+R = TypeVar('R', bound=ReactionProperty)
+
+
+class _ReactionWatch(PropertyWatch[R]):
+    """Measures the time since nodes have received a message."""
+
+    def __init__(self, required: R, world: Lockstep) -> None:
+        super().__init__(required, world)
+        self._world_time, self._clock = world.world_time, world.now
+        self._passed, self._jumped = 0, -math.inf
+        self._received: dict[Node, tuple[float, float]] = {}
+
+    def check(self) -> str | None:
+        # Where the clock jumps is noticed only when it is read.
+        self._time()
+        return super().check()
+
+    def received(self, node: Node) -> None:
+        """Note that a node has received a message."""
+        self._received[node] = self._time(), self.seconds
+
+    def late(self, node: Node, topic: str, subject: str = '') -> str | None:
+        """Return that a node, the `subject`, has received a topic too long ago; None: it has not."""
+        begin, seconds = self._received.setdefault(node, (self._time(), self.seconds))
+        passed = self._time() - max(begin, self._jumped)
+        within = self.required.within
+        if passed <= within + ROUNDING or node not in self.world.nodes:
+            return None
+        name = self.name_of(node)
+        subscribed = any(one.topic_name == topic for one in node.subscriptions)
+        if not subscribed or not is_named(name, self.required.node):
+            return None
+        allowed = within + delays(self.world, node, seconds)
+        if passed <= allowed + ROUNDING:
+            return None
+        return (
+            f'{passed:.6g} s after {subject or name} has received its last message on {topic}; '
+            f'allowed: {allowed:g} s'
+        )
+
+    def _time(self) -> float:
+        """Return the time that has passed for timers of the nodes (s), and note a jump of the clock."""
+        world_time, clock = self.world.world_time, self.world.now
+        by_world, by_clock = world_time - self._world_time, clock - self._clock
+        # After a pause a jump forward may look as if time had passed evenly.
+        jumped = by_world > 0 and any(
+            self._world_time < time * NANOSECONDS <= world_time
+            for fault in self.world.faults
+            for time in fault.clock_jumps
+        )
+        self._world_time, self._clock = world_time, clock
+        if 0 <= by_clock <= by_world and not jumped:
+            self._passed += by_clock
+        else:
+            self._passed += by_world
+            self._jumped = self._passed / NANOSECONDS
+        return self._passed / NANOSECONDS
+
+
+def delays(world: Lockstep, node: Node, since: float) -> float:
+    """Return by how much faults of a node may have delayed its reaction since a world time (s)."""
+    name, now = node.get_fully_qualified_name(), world.world_time / NANOSECONDS
+    total = 0.0
+    for fault in world.faults:
+        if fault.affected_node and is_named(name, fault.affected_node):
+            total += fault.reaction_delay(node, since, now)
+    return total
+
+
+def is_named(name: str, wanted: str) -> bool:
+    """Return whether the name of a node is the one that is wanted; an empty one: any."""
+    return not wanted or name.lstrip('/') == wanted.lstrip('/')
+
+
+@dataclass(frozen=True, repr=False)
+class StopsAfterLostOdometry(ReactionProperty):
+    """A controller stops the robot within a time after it has received its last odometry.
+
+    A controller is a node that publishes `commands` and is subscribed to `odom`, other than that of the
+    test. What counts is the odometry that it receives, after all faults of the topic, and the command
+    that it has published last, whether or not that arrives: longer than `within` after the last odometry
+    it must be zero. Before its first odometry the time counts from its first command. Nodes that were
+    removed or killed cannot stop anything, and are not checked. The time: see `ReactionProperty`.
+    """
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""
         return _LostOdometryWatch(self, world)
 
 
-class _Controller:
-    """A node that publishes commands, and may receive odometry."""
-
-    def __init__(self, node: Node, now: float, seconds: float) -> None:
-        self.node = node
-        self.command = Twist(0.0, 0.0)
-        self.received, self.seconds = now, seconds
-        self.subscribed = False
-
-
-class _LostOdometryWatch(Watch):
+class _LostOdometryWatch(_ReactionWatch[StopsAfterLostOdometry]):
     def __init__(self, required: StopsAfterLostOdometry, world: Lockstep) -> None:
-        super().__init__(world)
-        self._required = required
-        self._time = ReactionTime(world)
-        self._controllers: dict[Node, _Controller] = {}
-        world.expect(required.resolved(required.commands))
-        self._commands = world.on_published(required.resolved(required.commands), self._on_command)
-        world.expect(required.resolved(required.odom))
-        self._odom = world.on_delivered(required.resolved(required.odom), self._on_odometry)
+        super().__init__(required, world)
+        self._moving: dict[Node, Twist] = {}
+        self._commands = self.on_published(required.commands, self._on_command)
+        self._odom = self.on_delivered(required.odom, self._on_odometry)
 
     def _on_odometry(self, node: Node, _: type, __: Any) -> None:
-        controller = self._controllers.get(node)
-        if controller is None:
-            controller = self._controllers[node] = _Controller(node, self._time.now(), self.seconds)
-        else:
+        if node in self._moving:
             # Steps of time may be long: this one may come too late.
-            self._check(controller)
-        controller.received, controller.seconds = self._time.now(), self.seconds
-        controller.subscribed = True
-        if controller.command.v or controller.command.omega:
+            self._check(node)
             self.note(self._odom, ' was received by ', self.name_of(node))
+        self.received(node)
 
     def _on_command(self, publisher: Publisher, message: Any) -> None:
         node = self.owner(publisher)
         twist = read_twist(publisher.msg_type, message)
         if node is None or twist is None or node is self.world.node:
             return
-        controller = self._controllers.get(node)
-        if controller is None:
-            controller = self._controllers[node] = _Controller(node, self._time.now(), self.seconds)
-        if not controller.subscribed:
-            controller.subscribed = any(one.topic_name == self._odom for one in node.subscriptions)
-        controller.command = twist
+        if twist.is_zero:
+            self._moving.pop(node, None)
+        else:
+            self._moving[node] = twist
+        if node not in self._received:
+            self.received(node)
         self.note(self._commands, ': ', twist)
 
     def check(self) -> str | None:
-        """Return that a controller has not stopped in time; None: all have."""
-        for controller in self._controllers.values():
-            if not controller.command.is_zero:
-                self._check(controller)
-        return self._found
+        for node in self._moving:
+            self._check(node)
+        return super().check()
 
-    def _check(self, controller: _Controller) -> None:
-        passed, required = self._time.since(controller.received), self._required
-        if controller.command.is_zero or passed <= required.within + ROUNDING:
-            return
-        if controller.node not in self.world.nodes:
-            # It cannot stop anything any more.
-            controller.command = Twist(0.0, 0.0)
-            return
-        if not controller.subscribed or not is_named(self.name_of(controller.node), required.node):
-            return
-        allowed = required.within + delays(self.world, controller.node, controller.seconds)
-        if passed > allowed + ROUNDING:
-            name = self.name_of(controller.node)
-            self.found(
-                f'the last command of {name} is {controller.command}, {passed:.6g} s after it has '
-                f'received its last message on {self._odom}; allowed: {allowed:g} s'
-            )
+    def _check(self, node: Node) -> None:
+        if (late := self.late(node, self._odom, 'it')) is not None:
+            self.found(f'the last command of {self.name_of(node)} is {self._moving[node]}, {late}')
 
 
 @dataclass(frozen=True, repr=False)
-class StopsAfterLastCommand(Property):
+class StopsAfterLastCommand(ReactionProperty):
     """A robot stands still when it has not received a command for a time.
 
     A robot is a node that publishes `odom` and is subscribed to `commands`. What counts are the commands
     that it receives, after all faults of the topic, and the twists that it publishes in its odometry.
-    The time is measured as for `StopsAfterLostOdometry`.
+    The time: see `ReactionProperty`. Commands may be of any type.
 
     Attributes:
-        within: Longest time (s).
-        node: Name of the robot (default: all).
-        odom: Topic of the odometry (default: 'odom').
-        commands: Topic of the commands, of any type (default: 'cmd_vel').
         v: Largest speed that counts as standing (m/s) (default: 0.001).
         omega: Largest yaw rate that counts as standing (rad/s) (default: 0.001).
     """
 
-    within: NotNegative
-    node: Text = field(default='', kw_only=True)
-    odom: Name = field(default='odom', kw_only=True)
-    commands: Name = field(default='cmd_vel', kw_only=True)
     v: NotNegative = field(default=0.001, kw_only=True)
     omega: NotNegative = field(default=0.001, kw_only=True)
 
@@ -148,56 +190,23 @@ class StopsAfterLastCommand(Property):
         return _LastCommandWatch(self, world)
 
 
-class _LastCommandWatch(Watch):
+class _LastCommandWatch(_ReactionWatch[StopsAfterLastCommand]):
     def __init__(self, required: StopsAfterLastCommand, world: Lockstep) -> None:
-        super().__init__(world)
-        self._required = required
-        self._time = ReactionTime(world)
-        self._received: dict[Node, tuple[float, float]] = {}
-        self._robots: dict[Node, bool] = {}
-        world.expect(required.resolved(required.odom))
-        self._odom = world.on_published(required.resolved(required.odom), self._on_odometry)
-        world.expect(required.resolved(required.commands))
-        self._commands = world.on_delivered(required.resolved(required.commands), self._on_command)
+        super().__init__(required, world)
+        self._odom = self.on_published(required.odom, self._on_odometry)
+        self._commands = self.on_delivered(required.commands, self._on_command)
 
     def _on_command(self, node: Node, _: type, __: Any) -> None:
-        self._received[node] = self._time.now(), self.seconds
+        self.received(node)
         self.note(self._commands, ' was received by ', self.name_of(node))
 
     def _on_odometry(self, publisher: Publisher, message: Any) -> None:
-        now = self._time.now()
         twist = read_twist(publisher.msg_type, message)
-        if twist is None or (
-            abs(twist.v) <= self._required.v and abs(twist.omega) <= self._required.omega
-        ):
+        if twist is None or twist.is_within(self.required.v, self.required.omega):
             return
         node = self.owner(publisher)
-        if node is None or not self._is_robot(node):
-            return
-        received, seconds = self._received.setdefault(node, (now, self.seconds))
-        passed, within = self._time.since(received), self._required.within
-        if passed <= within + ROUNDING:
-            return
-        allowed = within + delays(self.world, node, seconds)
-        if passed > allowed + ROUNDING:
-            self.found(
-                f'{self._odom}: {twist}, {passed:.6g} s after {self.name_of(node)} has '
-                f'received its last message on {self._commands}; allowed: {allowed:g} s'
-            )
-
-    def check(self) -> str | None:
-        """Return that a robot has not stopped in time; None: all have."""
-        # Where the clock jumps is noticed only when it is read.
-        self._time.now()
-        return self._found
-
-    def _is_robot(self, node: Node) -> bool:
-        """Return whether a node is a robot that is checked."""
-        if node not in self._robots:
-            self._robots[node] = is_named(self.name_of(node), self._required.node) and any(
-                one.topic_name == self._commands for one in node.subscriptions
-            )
-        return self._robots[node]
+        if node is not None and (late := self.late(node, self._commands)) is not None:
+            self.found(f'{self._odom}: {twist}, {late}')
 
 
 @dataclass(frozen=True, repr=False)
@@ -221,41 +230,30 @@ class StopsOnShutdown(Property):
         return _ShutdownWatch(self, world)
 
 
-class _ShutdownWatch(Watch):
+class _ShutdownWatch(PropertyWatch[StopsOnShutdown]):
     def __init__(self, required: StopsOnShutdown, world: Lockstep) -> None:
-        super().__init__(world)
-        self._required = required
+        super().__init__(required, world)
         self._last: dict[Node, Twist] = {}
-        world.expect(required.resolved(required.commands))
-        self._commands = world.on_published(required.resolved(required.commands), self._on_command)
+        self._commands = self.on_published(required.commands, self._on_command)
 
     def _on_command(self, publisher: Publisher, message: Any) -> None:
         node, twist = self.owner(publisher), read_twist(publisher.msg_type, message)
         if node is None or twist is None or node is self.world.node:
             return
-        if is_named(self.name_of(node), self._required.node):
+        if is_named(self.name_of(node), self.required.node):
             self._last[node] = twist
         self.note(self._commands, ': ', twist)
 
     def check(self) -> str | None:
-        """Return that a node has left while the robot moved; None: none has."""
-        if self._last.keys() - self.world.nodes:
-            for node, twist in list(self._last.items()):
-                if node in self.world.nodes:
-                    continue
-                del self._last[node]
-                if not twist.is_zero and node not in self.world.killed:
-                    self.found(
-                        f'{self.name_of(node)} was shut down after the command {twist}; allowed: '
-                        'a command of zero before'
-                    )
-        return self._found
+        gone = self._last.keys() - self.world.nodes
+        for node in [one for one in self._last if one in gone]:
+            twist = self._last.pop(node)
+            if not twist.is_zero and node not in self.world.killed:
+                self.found(
+                    f'{self.name_of(node)} was shut down after the command {twist}; allowed: '
+                    'a command of zero before'
+                )
+        return super().check()
 
     def finish(self) -> str | None:
-        """As `check`."""
         return self.check()
-
-
-def is_named(name: str, wanted: str) -> bool:
-    """Return whether the name of a node is the one that is wanted; an empty one: any."""
-    return not wanted or name.lstrip('/') == wanted.lstrip('/')

@@ -22,10 +22,9 @@ from typing import TYPE_CHECKING
 from diffdrive_jacobian import lazy
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.exploration.executors import LocalExecutor, SerialExecutor
     from diffdrive_jacobian.exploration.exploring import explore
-    from diffdrive_jacobian.exploration.replay import Replay, reproducing
-    from diffdrive_jacobian.exploration.result import Exploration, Finding
+    from diffdrive_jacobian.exploration.processes import LocalExecutor, SerialExecutor
+    from diffdrive_jacobian.exploration.result import Exploration, Finding, Replay, reproducing
     from diffdrive_jacobian.exploration.scenario import ExplorationError, scenario_from
     from diffdrive_jacobian.exploration.schedules import (
         angles,
@@ -84,10 +83,9 @@ __all__ = [
 
 _MODULES = {
     'exploration.scenario': ('ExplorationError', 'scenario_from'),
-    'exploration.executors': ('LocalExecutor', 'SerialExecutor'),
     'exploration.exploring': ('explore',),
-    'exploration.replay': ('Replay', 'reproducing'),
-    'exploration.result': ('Exploration', 'Finding'),
+    'exploration.processes': ('LocalExecutor', 'SerialExecutor'),
+    'exploration.result': ('Exploration', 'Finding', 'Replay', 'reproducing'),
     'exploration.schedules': (
         *('angles', 'gains', 'goals', 'numbers', 'points', 'poses', 'probabilities', 'times'),
         *('fault_schedules', 'waypoints'),

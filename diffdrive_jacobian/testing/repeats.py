@@ -9,7 +9,7 @@ from typing import Any
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
 
-from diffdrive_jacobian.exploration.digest import MessageDigest
+from diffdrive_jacobian.exploration.trial import MessageDigest
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._report import brief
 from diffdrive_jacobian.lockstep.world import Lockstep

@@ -4,7 +4,7 @@
     python test/exploration/explore_defects.py --worlds 100 'no defect' some of them
     python test/exploration/explore_defects.py --page doc/exploration.md  write the table into a page
 
-All controllers are tried in the same worlds and against the same properties (`defect_scenario.py`). An
+All controllers are tried in the same worlds and against the same properties. An
 exploration stops at the first block of 50 worlds with a violation. The right controller runs in all
 worlds. Exit code 1: a defect was not found, or the right controller violates something.
 """
@@ -19,8 +19,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from defect_scenario import LAST_EVENT, PROPERTIES, drive
-from defective_controllers import CONTROLLERS, DEFECTIVE
+from defective_controllers import CONTROLLERS, DEFECTIVE, LAST_EVENT, PROPERTIES, drive
 from hypothesis import strategies as st
 
 from diffdrive_jacobian import faults

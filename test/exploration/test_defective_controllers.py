@@ -6,8 +6,7 @@ Each defect has one small world that shows it. `explore_defects.py` finds such w
 from __future__ import annotations
 
 import pytest
-from defect_scenario import PROPERTIES, drive
-from defective_controllers import DEFECTIVE
+from defective_controllers import DEFECTIVE, PROPERTIES, drive
 
 from diffdrive_jacobian.faults import Duplicate, Hang, Loss, TimeJump
 from diffdrive_jacobian.testing import Lockstep, PropertyViolation

@@ -68,9 +68,9 @@ def test_the_numbers_are_counted(found):
 
 
 def test_the_same_seed_finds_the_same(found):
-    again = serial(follow, [SLOW], faults=LOSSES, worlds=12, shrink_worlds=0)
-    assert (again.checks, again.faults) == (found.checks, found.faults)
-    assert again.findings[0].first_trial == found.findings[0].first_trial
+    first = found.findings[0]
+    again = serial(follow, [SLOW], faults=LOSSES, worlds=first.first_world + 1, shrink_worlds=0)
+    assert again.findings[0].first_trial == first.first_trial
 
 
 def test_a_finding_is_replayed(found, monkeypatch):

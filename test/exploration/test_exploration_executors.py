@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from diffdrive_jacobian import signals
 from diffdrive_jacobian.control import find_controller
-from diffdrive_jacobian.exploration.child import call_in_child
+from diffdrive_jacobian.exploration.processes import call_in_child
 from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.properties import NeverFasterThan
 from diffdrive_jacobian.simulation import Sweep, SweepSetup, sweep
@@ -29,7 +29,13 @@ from diffdrive_jacobian.testing import LocalExecutor, explore, fault_schedules
 
 pytestmark = pytest.mark.process
 LOSSES = fault_schedules(['speed'], kinds=[Loss], duration=1.2)
-FOLLOW = {'scenario': follow, 'properties': [NeverFasterThan(0.35, 1.0)], 'faults': LOSSES}
+FOLLOW = {
+    'scenario': follow,
+    'properties': [NeverFasterThan(0.35, 1.0)],
+    'faults': LOSSES,
+    'worlds': 7,
+    'shrink_worlds': 2,
+}
 SPEEDS = st.fixed_dictionaries({'speed': st.sampled_from([0.0, 1.0, 2.0])})
 SETUP = SweepSetup(grid=3, starts=2, rate=20.0)
 PYTHON = sys.executable
@@ -46,6 +52,12 @@ def local():
     """Return the default executor, with one process for all tests."""
     with LocalExecutor(1) as executor:
         yield executor
+
+
+@pytest.fixture(scope='module')
+def expected():
+    """Return an exploration and a sweep of this thread."""
+    return serial(**FOLLOW), sweep(SETUP)
 
 
 @contextmanager
@@ -65,12 +77,12 @@ def dask():
 
 
 @pytest.mark.parametrize('make', [processes, lambda: LocalExecutor(1), dask])
-def test_an_executor_explores_and_sweeps_as_this_thread_does_bit_for_bit(make, monkeypatch):
+def test_an_executor_explores_and_sweeps_as_this_thread_does_bit_for_bit(make, expected, monkeypatch):
     # One row of the grid for each task.
     monkeypatch.setattr(sys.modules[SweepSetup.__module__], 'LOOPS_PER_TASK', 1)
-    found, swept = serial(**FOLLOW, worlds=7, shrink_worlds=4), sweep(SETUP)
+    found, swept = expected
     with make() as executor:
-        again = explore(**FOLLOW, worlds=7, shrink_worlds=4, executor=executor)
+        again = explore(**FOLLOW, executor=executor)
         parts = sweep(SETUP, executor=executor)
     assert again.findings == found.findings
     assert again.findings[0].digest
@@ -80,15 +92,14 @@ def test_an_executor_explores_and_sweeps_as_this_thread_does_bit_for_bit(make, m
         np.testing.assert_array_equal(ours, theirs)
 
 
-def use_random_numbers_in_a_thread(_):
-    """As the threads of Dask do at any time."""
-    thread = Thread(target=random.random)
-    thread.start()
-    thread.join()
-
-
 def test_random_numbers_of_other_threads_do_not_end_the_generation_of_worlds():
-    cases = st.integers(0, 5).map(use_random_numbers_in_a_thread)
+    def use_random_numbers(_):
+        """As the threads of Dask do at any time."""
+        thread = Thread(target=random.random)
+        thread.start()
+        thread.join()
+
+    cases = st.integers(0, 5).map(use_random_numbers)
     assert serial(nothing, cases=cases, worlds=1).worlds == 1
 
 
@@ -135,7 +146,7 @@ def test_two_sigint_of_one_request_end_an_exploration_once(monkeypatch):
 
 
 ENDLESS = """
-from diffdrive_jacobian.exploration.child import ChildProcess
+from diffdrive_jacobian.exploration.processes import ChildProcess
 child = ChildProcess()
 print(child._process.pid, flush=True)
 child.call(exec, 'print("busy", flush=True)\\nwhile True: pass')

@@ -11,8 +11,9 @@ import pytest
 from exploration_scenarios import Follower, Sensor, failing, follow, robot, serial
 from hypothesis import strategies as st
 
-from diffdrive_jacobian.exploration.child import _picklable
-from diffdrive_jacobian.exploration.worker import result_of
+from diffdrive_jacobian.exploration.exploring import result_of
+from diffdrive_jacobian.exploration.output import remove_others, write_finding
+from diffdrive_jacobian.exploration.processes import _picklable
 from diffdrive_jacobian.faults import Hang, Loss
 from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.plots.fault_marks import VIOLATION
@@ -51,16 +52,16 @@ class Interrupting(SerialExecutor):
 
 @pytest.fixture(scope='module')
 def written(tmp_path_factory):
-    """Return the folder of a finding, to be copied."""
-    return explored(tmp_path_factory.mktemp('written'))[0].directory
+    """Return a finding, whose folder is to be copied."""
+    return explored(tmp_path_factory.mktemp('written'))[0]
 
 
 def test_what_was_not_found_again_is_removed(tmp_path, written):
     """Only what an exploration has written, not what the user has added, renamed or copied."""
     output = tmp_path / 'found'
-    folder = output / written.name
+    folder = output / written.directory.name
     for copied in (folder, output / 'kept', output / 'CopiedTest'):
-        shutil.copytree(written, copied)
+        shutil.copytree(written.directory, copied)
     (output / 'CopiedTest' / 'test_copied_test.py').write_text('own = 1\n')
     (output / 'other' / 'run').mkdir(parents=True)
     (output / 'other' / 'test_other.py').write_text('own = 1\n')
@@ -122,17 +123,18 @@ CHANGED = {
 @pytest.mark.parametrize('what', [*IN_THE_WAY, *CHANGED])
 def test_what_somebody_else_has_written_or_changed_stays(tmp_path, written, what):
     """With the rest of its folder: a changed test needs the case."""
-    folder = tmp_path / 'found' / written.name
+    folder = tmp_path / 'found' / written.directory.name
     folder.parent.mkdir()
     if what in CHANGED:
-        shutil.copytree(written, folder)
+        shutil.copytree(written.directory, folder)
     {**IN_THE_WAY, **CHANGED}[what](folder, tmp_path / 'own')
     before = contents(tmp_path)
-    (finding,) = explored(folder.parent)
+    again = write_finding(written, folder.parent, [], seed=0)
     free = what == 'another name'
-    assert finding.directory == (folder if free else folder.with_name(f'{folder.name}_2'))
+    assert again.directory == (folder if free else folder.with_name(f'{folder.name}_2'))
+    assert again.notes == written.notes
     assert contents(tmp_path).items() >= before.items()
-    explored(folder.parent, 1)
+    remove_others(folder.parent, [])
     assert contents(tmp_path) == before
 
 
@@ -226,26 +228,23 @@ def test_an_error_without_text_of_a_process_is_reported():
             result_of(future, None)
 
 
-def test_a_long_property_does_not_hide_what_was_found(tmp_path):
-    near = StaysNear([(0.1 * number, 5.0) for number in range(61)], 0.1)
-    (finding,) = serial(robot, [near], worlds=1, shrink_worlds=0, output=tmp_path).findings
-    assert finding.violation.key == repr(near)
-    assert len(str(finding)) < 1000
-    title = next(finding.directory.glob('test_*.py')).read_text().partition('\n')[0]
-    assert re.fullmatch(r'"""StaysNear.{1,200}\.\.\. is violated at [\d.]+ s\.', title)
-
-
-def test_the_picture_marks_the_violation(tmp_path, monkeypatch):
+def test_a_long_property_is_cut_and_the_picture_marks_when_it_is_violated(tmp_path, monkeypatch):
     """At its time since the first odometry, with the name of the property."""
     drawn = []
     monkeypatch.setattr(run_figure, 'render', lambda one, ending: drawn.append(one) or b'')
+    near = StaysNear([(0.1 * number, 5.0) for number in range(61)], 0.1)
     fast = NeverFasterThan(0.2, 1.0)
-    (finding,) = serial(robot, [fast], worlds=1, shrink_worlds=0, output=tmp_path).findings
-    (drawing,) = drawn
+    found = serial(robot, [near, fast], worlds=1, shrink_worlds=0, output=tmp_path).findings
+    long, short = sorted(found, key=lambda one: one.violation.name, reverse=True)
+    assert long.violation.key == repr(near)
+    assert len(str(long)) < 1000
+    title = next(long.directory.glob('test_*.py')).read_text().partition('\n')[0]
+    assert re.fullmatch(r'"""StaysNear.{1,200}\.\.\. is violated at [\d.]+ s\.', title)
+    drawing = drawn[found.index(short)]
     (legend,) = drawing.legends
     assert [text.get_text() for text in legend.get_texts()] == [f'violated: {fast!r}']
     (mark,) = (line for line in drawing.axes[1].lines if line.get_color() == VIOLATION)
-    assert mark.get_xdata()[0] == pytest.approx(finding.violation.seconds, abs=0.05)
+    assert mark.get_xdata()[0] == pytest.approx(short.violation.seconds, abs=0.05)
 
 
 def test_faults_without_effect_are_noted_once_for_each_name():

@@ -14,10 +14,10 @@ from hypothesis import find, given, settings
 from hypothesis import strategies as st
 
 from diffdrive_jacobian import faults
+from diffdrive_jacobian.exploration.result import differences, versions
 from diffdrive_jacobian.exploration.scenario import ScenarioName, Source
 from diffdrive_jacobian.exploration.schedules import generate, shrink, trials
 from diffdrive_jacobian.exploration.trial import Trial
-from diffdrive_jacobian.exploration.versions import differences, versions
 from diffdrive_jacobian.testing import (
     ExplorationError,
     angles,

@@ -6,11 +6,11 @@ import pytest
 from explored_nodes import SCENARIOS, properties
 
 from diffdrive_jacobian import faults
-from diffdrive_jacobian.exploration.digest import MessageDigest
+from diffdrive_jacobian.exploration.trial import MessageDigest
 from diffdrive_jacobian.testing import Lockstep, SerialExecutor, explore
 
 pytestmark = [pytest.mark.slow, pytest.mark.parametrize('name', SCENARIOS)]
-WORLDS = 8
+WORLDS = 4
 
 
 def test_nothing_is_found_in_our_nodes(name, tmp_path):

@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian import faults
 from diffdrive_jacobian.properties import end_of_faults
-from diffdrive_jacobian.properties._node_time import delays
+from diffdrive_jacobian.properties.stopping import delays
 from diffdrive_jacobian.testing import LockstepError
 
 INF = float('inf')

@@ -33,7 +33,7 @@ import types
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TextIO
 
@@ -64,12 +64,9 @@ serve(int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])
 
 
 def serve(descriptor: int, listening: int, modules: list[str]) -> None:
-    """Import modules and fork for each request. End when a connection is closed.
+    """Import modules and fork for each request, until the process that has started this one ends.
 
-    Args:
-        descriptor: The connection to who has started this process.
-        listening: The socket at which commands connect, see `make_commands`.
-        modules: Names of what is to be imported.
+    `descriptor` is the connection to that, `listening` the socket to which all others connect.
     """
     # Children get descriptors of these numbers. Libraries must not have them.
     for _ in range(RESERVED):
@@ -147,13 +144,12 @@ class _SharedModules:
     """
 
     def __init__(self) -> None:
-        """Prepare that, before modules are imported whose functions are to be called at the exit."""
+        # Before modules are imported whose functions are to be called at the exit.
         self._removed: dict[str, None] = {}
         # The interpreter does the same as it exits, and clears the modules that it finds there.
         atexit.register(sys.modules.update, self._removed)
 
     def keep(self) -> None:
-        """Keep what is imported now."""
         gc.collect()
         gc.freeze()
         modules = {
@@ -170,14 +166,12 @@ class _Tracing:
     """
 
     def __init__(self) -> None:
-        """Find the library in this process, if it is there."""
         maps = Path('/proc/self/maps').read_text()
         found = re.search(r'/\S*/liblttng-ust[-\da-f]*\.so\S*', maps)
         self._library = ctypes.CDLL(found[0]) if found else None
         self._signals = ctypes.create_string_buffer(128)
 
     def before_fork(self) -> None:
-        """Prepare the library."""
         self._call('before_fork')
 
     def after_fork(self, *, child: bool) -> None:
@@ -214,12 +208,7 @@ def _import(name: str) -> None:
 def _run(python: str, code: str, argv: list[str], directory: str, environment: dict[str, str]) -> None:
     """Run a program, as `python -c CODE ARGUMENTS` does, or `python FILE ARGUMENTS`.
 
-    Args:
-        python: `sys.executable`. Empty: that of the server.
-        code: Text of the program.
-        argv: `-c` or the name of its file, and its arguments.
-        directory: Its working directory.
-        environment: Its environment variables.
+    `python` becomes `sys.executable`. Empty: that of the server.
     """
     for number, name in enumerate(('stdin', 'stdout', 'stderr')):
         unbuffered = bool(environment.get('PYTHONUNBUFFERED'))
@@ -255,7 +244,6 @@ class _QuickExit:
     """
 
     def __init__(self) -> None:
-        """Prepare that."""
         self._code: int | None = None
         self._exit = ctypes.CDLL(None).exit
         # Called last: registered first.
@@ -263,11 +251,9 @@ class _QuickExit:
         # Builtins are cleared last.
         builtins._quick_exit = self  # type: ignore[attr-defined]
 
-    def __enter__(self) -> None:
-        """Run the program."""
+    def __enter__(self) -> None: ...
 
     def __exit__(self, kind: object, error: BaseException | None, _: object) -> None:
-        """Find out the exit code."""
         if isinstance(error, SystemExit):
             code = 0 if error.code is None else error.code
             self._code = code if isinstance(code, int) else 1
@@ -282,7 +268,6 @@ class _QuickExit:
             self._code = None
 
     def __del__(self) -> None:
-        """End the process."""
         if self._code is not None:
             self._exit(self._code)
 
@@ -310,49 +295,36 @@ def _text_stream(original: TextIO, descriptor: int, *, unbuffered: bool) -> io.T
 # --- In the tests
 
 
-class _Server:
-    """A process that forks children for all who connect to its socket."""
+def _listen(modules: tuple[str, ...], folder: str) -> socket.socket:
+    """Create the socket of the server that imports these modules."""
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    listener.bind(_path(modules, folder))
+    listener.listen(100)
+    return listener
 
-    def __init__(self, modules: tuple[str, ...], folder: str) -> None:
-        """Create its socket.
 
-        Args:
-            modules: Names of what it is to import.
-            folder: Where its socket is to be.
-        """
-        self._modules = modules
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._listener.bind(_path(modules, folder))
-        self._listener.listen(100)
-
-    def start(self) -> None:
-        """Start it. It ends with this process."""
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        passed = [theirs.fileno(), self._listener.fileno()]
-        here, numbers = str(Path(__file__).parent), map(str, passed)
+def _start(modules: tuple[str, ...], listener: socket.socket, *, when_used: bool = False) -> None:
+    """Start a server, which ends with this process."""
+    if when_used:
+        select.select([listener], [], [])
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs, listener:
+        passed = [theirs.fileno(), listener.fileno()]
         process = subprocess.Popen(
-            [sys.executable, '-c', SERVER, here, *numbers, *self._modules],
+            [sys.executable, '-c', SERVER, str(Path(__file__).parent), *map(str, passed), *modules],
             stdin=subprocess.DEVNULL,
             pass_fds=passed,
             # NumPy starts a thread for every core otherwise.
             env={**os.environ, 'OPENBLAS_NUM_THREADS': '1', 'ROS_PYTHON_CHECK_FIELDS': '1'},
         )
-        self._listener.close()
-        theirs.close()
-        atexit.register(process.wait)
-        atexit.register(ours.close)
-
-    def start_when_used(self) -> None:
-        """Start it as soon as somebody connects."""
-        select.select([self._listener], [], [])
-        self.start()
+    atexit.register(process.wait)
+    atexit.register(ours.close)
 
 
 class _Connection:
     """A connection to a server. Threads may share it."""
 
     def __init__(self, path: str) -> None:
-        """Connect to the server at a socket."""
         self.path = path
         self._lock = threading.Lock()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -391,7 +363,8 @@ def share() -> str:
     """
     folder = _folder()
     for modules in SETS:
-        threading.Thread(target=_Server(modules, folder).start_when_used, daemon=True).start()
+        start = partial(_start, modules, _listen(modules, folder), when_used=True)
+        threading.Thread(target=start, daemon=True).start()
     return folder
 
 
@@ -405,7 +378,7 @@ def _server(modules: tuple[str, ...], process: int) -> _Connection:
     if _shared:
         return _Connection(_path(modules, _shared[-1]))
     folder = _folder()
-    _Server(modules, folder).start()
+    _start(modules, _listen(modules, folder))
     return _Connection(_path(modules, folder))
 
 
@@ -415,17 +388,7 @@ class Popen:
     def __init__(
         self, code, arguments=(), *, modules=EVERYTHING, cwd=None, env=None, stdout=None, stderr=None
     ):
-        """Run `python -c CODE ARGUMENTS`.
-
-        Args:
-            code: Text of the program.
-            arguments: Arguments of the program.
-            modules: Modules that the server has imported.
-            cwd: Its working directory (default: that of this process).
-            env: Its environment (default: that of this process).
-            stdout: A file, a descriptor or `subprocess.PIPE` (default: that of this process).
-            stderr: The same.
-        """
+        """Run `python -c CODE ARGUMENTS` in a fork of the server that has imported `modules`."""
         argv = ['-c', *map(str, arguments)]
         self.args = [sys.executable, '-c', code, *argv[1:]]
         self.returncode = None
@@ -485,15 +448,7 @@ class Popen:
 def run(code, arguments=(), *, stdout=None, timeout=None, **kwargs):
     """Run a program to its end; return what it printed, as `subprocess.run` with `capture_output=True`.
 
-    Args:
-        code: Text of the program.
-        arguments: Its arguments.
-        stdout: A file for its standard output, which is not returned then.
-        timeout: Time after which it is killed (s).
-        kwargs: As for `Popen`.
-
-    Raises:
-        subprocess.TimeoutExpired: It was killed.
+    What goes into a given `stdout` is not returned.
     """
     with tempfile.TemporaryFile('w+') as out, tempfile.TemporaryFile('w+') as error:
         child = Popen(code, arguments, stdout=stdout or out, stderr=error, **kwargs)
@@ -509,16 +464,11 @@ def run(code, arguments=(), *, stdout=None, timeout=None, **kwargs):
 
 
 def make_commands(folder, scripts):
-    """Make commands that run Python scripts in forks of the server; return the folder.
+    """Make commands that run Python scripts in forks of the server, in a folder; return that.
 
-    A command is a small process of its own, which passes its arguments, streams and signals on, and ends
-    as the script does.
-
-    Args:
-        folder: Where to make them.
-        scripts: Files of the scripts. A command has the name of its script. `python` makes one that
-            takes a file, `-c` or `-m` as the interpreter does, and with which the scripts start
-            processes.
+    A command is a small process of its own with the name of its script, which passes its arguments,
+    streams and signals on, and ends as the script does. `python` among the scripts makes one that takes
+    a file, `-c` or `-m` as the interpreter does, and with which the scripts start processes.
     """
     folder.mkdir()
     server = _server(EVERYTHING, os.getpid())

@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 from support.processes import PROGRAM
 
 from diffdrive_jacobian.bags.bag_reader import open_bag
-from diffdrive_jacobian.exploration.digest import MessageDigest
+from diffdrive_jacobian.exploration.trial import MessageDigest
 from diffdrive_jacobian.faults import ClockPause, Corrupt, Delay, Hang, Kill, Loss, Slow, TimeJump
 from diffdrive_jacobian.lockstep.external import datagrams, node_process
 from diffdrive_jacobian.lockstep.external import process as external_process

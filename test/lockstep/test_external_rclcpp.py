@@ -14,7 +14,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.exploration.digest import MessageDigest
+from diffdrive_jacobian.exploration.trial import MessageDigest
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.testing import Lockstep
 
