@@ -18,8 +18,7 @@ from diffdrive_jacobian.exploration.versions import differences, versions
 from diffdrive_jacobian.exploration.worker import packed, run_world_afresh, run_worlds
 from diffdrive_jacobian.lockstep._errors import PropertyViolation
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.plots.fault_marks import ViolationMark
-from diffdrive_jacobian.plots.run_figure import draw
+from diffdrive_jacobian.plots.run_figure import ViolationMark, draw
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.text import printable_lines

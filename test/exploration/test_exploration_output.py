@@ -15,7 +15,7 @@ from diffdrive_jacobian.exploration.child import _picklable
 from diffdrive_jacobian.exploration.worker import result_of
 from diffdrive_jacobian.faults import Hang, Loss
 from diffdrive_jacobian.plots import run_figure
-from diffdrive_jacobian.plots.fault_marks import VIOLATION
+from diffdrive_jacobian.plots.run_figure import VIOLATION
 from diffdrive_jacobian.properties import NeverFasterThan, Property, StaysNear, Watch
 from diffdrive_jacobian.testing import (
     ExplorationError,
