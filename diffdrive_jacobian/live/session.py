@@ -44,7 +44,7 @@ class Page:
     """One open page: what it has received so far."""
 
     def __init__(self, number: int, notice: int) -> None:
-        """Start with a number of its own, after the last notice."""
+        """Start after a notice."""
         self.number = number
         self._version = -1
         self._notice = notice

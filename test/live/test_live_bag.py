@@ -15,9 +15,8 @@ from support.ros_messages import twist
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.bag_reader import BagError
 from diffdrive_jacobian.drives import drive
-from diffdrive_jacobian.live.bag_player import BagPlayer
+from diffdrive_jacobian.live.bag_player import BagPlayer, RecordedRobot, read_robots
 from diffdrive_jacobian.live.commands import CancelGoal, Pause, Seek, SetSpeed, Step
-from diffdrive_jacobian.live.recorded_runs import read_robots
 from diffdrive_jacobian.live.session import Session
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.recording.recorder import Recorder
@@ -143,7 +142,7 @@ def test_gains_of_another_package_are_shown_as_recorded(bag, robots):
     (robot,) = robots
     values = {**robot.run.of_node('go_to_goal'), 'controller': 'mine', 'k1': 2.5, 'Odd.name': 1.0}
     run = replace(robot.run, parameters={'/go_to_goal': {**values, 'k2': math.nan}})
-    player = Player(bag, [replace(robot, run=run)])
+    player = Player(bag, [RecordedRobot('/', run, robot.start)])
     rows = player.session.latest()[1].fixed['settings']['/']
     keys = {row['key']: row['value'] for row in rows}
     assert keys['controller/k1'] == 2.5
@@ -154,7 +153,9 @@ def test_the_page_follows_changes_of_the_controller(bag, robots):
     (robot,) = robots
     received = int(robot.run.odometry.received[20])
     change = (received, '/go_to_goal', {'use_goal_heading': True})
-    player = Player(bag, [replace(robot, run=replace(robot.run, parameter_events=(change,)))])
+    player = Player(
+        bag, [RecordedRobot('/', replace(robot.run, parameter_events=(change,)), robot.start)]
+    )
     for index, expected in ((19, False), (20, True), (19, False)):
         player.send(Seek(float(robot.time[index]) + 1e-6))
         assert player.robot['use_heading'] is expected
@@ -185,7 +186,7 @@ def test_what_is_no_run(tmp_path):
 @pytest.mark.process
 def test_a_bag_is_watched_without_ros():
     """In an interpreter of its own."""
-    program = 'import sys, diffdrive_jacobian.live.serving, diffdrive_jacobian.tools.watch_run\n'
+    program = 'import sys, diffdrive_jacobian.live.bag_player, diffdrive_jacobian.tools.watch_run\n'
     program += 'print(*{name.split(".")[0] for name in sys.modules})'
     run = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True)
     assert not set(run.stdout.split()) & {*ROS_MODULES, 'rpyutils', 'matplotlib'}

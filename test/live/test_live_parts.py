@@ -12,13 +12,13 @@ import pytest
 
 from diffdrive_jacobian.control import KP, KV, OFFSET, Arrival, circle_path
 from diffdrive_jacobian.kinematics import diff_drive
-from diffdrive_jacobian.live import files, robot_state, settings
+from diffdrive_jacobian.live import robot_state, settings
 from diffdrive_jacobian.live.commands import Pause, SetSpeed, Step
-from diffdrive_jacobian.live.goal_progress import GoalProgress
 from diffdrive_jacobian.live.hand import CANCEL_PATIENCE, DEAD_MAN, Act, HandDriving
-from diffdrive_jacobian.live.pacing import Pacing
+from diffdrive_jacobian.live.node import Pacing
 from diffdrive_jacobian.live.quantities import chain, errors, region, rounded
-from diffdrive_jacobian.live.robot_state import SPACING, RobotState, Trail
+from diffdrive_jacobian.live.robot_state import SPACING, GoalProgress, RobotState, Trail
+from diffdrive_jacobian.live.server import page_files
 from diffdrive_jacobian.live.session import MAX_COMMANDS, MAX_NOTICES, Session, Snapshot
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.parameters.declaration import specifications
@@ -353,7 +353,7 @@ def test_settings_that_are_shown_and_taken():
 
 
 def test_the_page_loads_nothing_from_elsewhere():
-    found = files.page_files()
+    found = page_files()
     assert {'index.html', 'main.js', 'theme.css', 'icon.svg'} <= set(found)
     for name, (_, content) in found.items():
         text = content.decode().replace('http://www.w3.org/2000/svg', '')
@@ -361,7 +361,7 @@ def test_the_page_loads_nothing_from_elsewhere():
 
 
 def test_modules_and_elements_that_are_used_exist():
-    texts = {name: content.decode() for name, (_, content) in files.page_files().items()}
+    texts = {name: content.decode() for name, (_, content) in page_files().items()}
     ids = set(re.findall(r'id="([\w-]+)"', texts['index.html']))
     for name, text in texts.items():
         for used in re.findall(r"byId\('([\w-]+)'\)", text):
@@ -376,7 +376,7 @@ def test_modules_and_elements_that_are_used_exist():
 
 
 def test_every_control_has_a_name():
-    html = files.page_files()['index.html'][1].decode()
+    html = page_files()['index.html'][1].decode()
     for tag in re.findall(r'<(?:button|canvas|select|input)[^>]*>[^<]*', html):
         text = tag.split('>', 1)[1].strip()
         labelled = 'aria-label' in tag or any(letter.isalpha() for letter in text)
