@@ -46,8 +46,7 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep.external.expectations import Answers, Every, Idle
     from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.nodes.goal_client import path_message
-    from diffdrive_jacobian.testing.golden_run import GoldenRun
-    from diffdrive_jacobian.testing.recorded_run import RecordedRun
+    from diffdrive_jacobian.testing.recorded_run import GoldenRun, RecordedRun
 
 __all__ = [
     'Answers',
@@ -95,8 +94,7 @@ _MODULES = {
     'lockstep.external.expectations': ('Answers', 'Every', 'Idle'),
     'lockstep.world': ('Lockstep',),
     'nodes.goal_client': ('path_message',),
-    'testing.golden_run': ('GoldenRun',),
-    'testing.recorded_run': ('RecordedRun',),
+    'testing.recorded_run': ('GoldenRun', 'RecordedRun'),
 }
 
 if not TYPE_CHECKING:
