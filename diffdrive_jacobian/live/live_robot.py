@@ -160,10 +160,10 @@ class LiveRobot:
         """Parameters by role."""
         self.hand = HandDriving()
         # Before they are needed, so that they are discovered by then.
-        self._services = {}
-        for name in SERVICES:
-            full = self.topics.full(name)
-            self._services[name] = ServiceClient(node, Trigger, full, patience=PATIENCE, server=full)
+        self._services = {
+            name: ServiceClient(node, Trigger, full, patience=PATIENCE, server=full)
+            for name, full in ((name, self.topics.full(name)) for name in SERVICES)
+        }
         self._frame = ''
         self._seen = self._commanded = clock()
         self._sent, self._stamp = -math.inf, 0
@@ -210,8 +210,7 @@ class LiveRobot:
         self.state.moved(seconds(motion.stamp), np.array(motion.pose), motion.twist, covariance)
 
     def _on_goals(self, route: Route) -> None:
-        goals = np.array(route.poses, dtype=np.float64)
-        self.state.goal.sent(goals.reshape(-1, 3), route.stamp)
+        self.state.goal.sent(np.reshape(route.poses, (-1, 3)), route.stamp)
 
     def _on_path(self, route: Route) -> None:
         # One that is no path is refused by the controller.
@@ -344,9 +343,8 @@ class LiveRobot:
 
     def _rolls_on(self) -> str:
         """Describe how far the robot rolls after zero was sent, as far as its limits are known."""
-        link = self.links.get('robot')
         try:
-            model = from_ros(VirtualRobotParameters, link.values if link else {}).model()
+            model = from_ros(VirtualRobotParameters, self.state.robot_values).model()
         except ParameterError:
             # The robot is another node, with parameters of the same names.
             return ''
@@ -394,12 +392,8 @@ class LiveRobot:
         """Advance queries of parameters."""
         for service in self._services.values():
             service.advance()
-        for role, link in self.links.items():
+        for link in self.links.values():
             link.advance()
-            if role == 'robot':
-                self.state.robot_values = link.values
-            else:
-                self.state.controller_values = link.values
 
     def shown(self) -> dict[str, Any] | None:
         """Return the JSON object for the page."""
@@ -413,8 +407,7 @@ class LiveRobot:
 
     def _gains(self) -> tuple[Gain, ...]:
         """Return the gains of the controller that is chosen."""
-        link = self.links.get('controller')
-        return settings.gains(str(link.values.get('controller', ''))) if link else ()
+        return settings.gains(str(self.state.controller_values.get('controller', '')))
 
     def destroy(self) -> None:
         """Destroy all entities."""
@@ -428,7 +421,12 @@ class LiveRobot:
         """Take the nodes that have the parameters, by role."""
         for role, name in found.items():
             link = self.links.get(role)
-            if link is not None and link.target != name:
+            if link is not None and link.target == name:
+                continue
+            if link is not None:
                 link.destroy()
-            if link is None or link.target != name:
-                self.links[role] = ParameterLink(self._node, name)
+            link = self.links[role] = ParameterLink(self._node, name)
+            if role == 'robot':
+                self.state.robot_values = link.values
+            else:
+                self.state.controller_values = link.values

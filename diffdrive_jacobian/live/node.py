@@ -134,10 +134,10 @@ class LivePage(Node):  # type: ignore[misc]
         Args:
             session: What the page shows, and where its commands come from.
             context: Context of the node.
-            polled: Whether it is run by a SingleThreadedExecutor: it then polls its topics with a timer
-                of its own. Otherwise `work` must be called often.
+            polled: Whether it polls its topics with a timer of its own, as a SingleThreadedExecutor
+                needs it. Otherwise `work` must be called often.
             pacing: Control of simulated time. None: time is real.
-            goal_ended: Receives the end of each goal. None: nothing does.
+            goal_ended: Receives the end of each goal.
         """
         super().__init__(NAME, context=context, start_parameter_services=False)
         self._session, self._polled, self._pacing = session, polled, pacing
@@ -326,13 +326,13 @@ def drive_live(
         isolated: Whether no other process can communicate with the nodes.
         parameters: Parameters of go_to_goal.
         robot_parameters: Parameters of virtual_robot.
-        recording: Recording of what the nodes publish. The caller must finish it. None: none.
+        recording: Recording of what the nodes publish. The caller must finish it.
         ros_arguments: ROS arguments of all nodes.
         port: As for `watch_nodes`.
         signals: Likewise.
         ready: Likewise.
         nodes_created: Receives the fully qualified names of the nodes.
-        goal_ended: Receives the end of each goal. None: nothing does.
+        goal_ended: Receives the end of each goal.
 
     Raises:
         UserError: A node cannot run with the parameters or ROS arguments given.

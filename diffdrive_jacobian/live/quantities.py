@@ -36,10 +36,7 @@ def rounded(value: Any) -> Any:
 
 
 def region(covariance: Array) -> dict[str, Any] | None:
-    """Return the ellipse that contains the position with 95 %, and the deviation of the heading.
-
-    Args:
-        covariance: Covariance of `[x, y, theta]`, shape (3, 3).
+    """Return the ellipse that contains the position with 95 %, of a covariance, shape (3, 3).
 
     Returns:
         Half axes `a >= b` (m), the direction of a (rad), and 1.96 standard deviations of the heading
@@ -59,10 +56,7 @@ def region(covariance: Array) -> dict[str, Any] | None:
 def errors(pose: Array, goal: Array, offset: float) -> Pair:
     """Return the distance of the driven point to a goal (m), and the bearing error (rad).
 
-    Args:
-        pose: `[x, y, theta]`, shape (3,).
-        goal: Likewise.
-        offset: X coordinate of the driven point in the body frame (m).
+    Pose and goal are `[x, y, theta]`, offset is the x coordinate of the point in the body frame (m).
     """
     x, y, theta = pose.tolist()
     distance = float(Arrival(offset=offset).distance(x, y, theta, float(goal[0]), float(goal[1])))

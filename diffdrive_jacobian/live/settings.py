@@ -52,11 +52,8 @@ class Setting:
     """Heading below which it is folded away while none of the group is in use; '': always shown."""
 
     def slider(self, served: Range | None) -> Range:
-        """Return the range of the slider for a node that serves a range in its descriptor.
-
-        A node of this package serves all valid values, of which the usual ones are shown. Another node
-        knows better.
-        """
+        """Return the range of the slider for a node that serves a range in its descriptor."""
+        # A node of this package serves all valid values, of which the usual ones are shown.
         return (self.low, self.high) if served is None or served == self.declared else served
 
     @property
@@ -177,10 +174,7 @@ def shown(
 ) -> list[dict[str, Any]]:
     """Return the settings that nodes have, with their values, for the page.
 
-    Args:
-        values: Parameters by role.
-        gains: Gains of the controller.
-        ranges: Ranges that the nodes serve in the descriptors of their parameters, by role.
+    `values` and `ranges` are the parameters by role, and the ranges that the nodes serve.
     """
     found = []
     for setting in offered(gains):
@@ -198,14 +192,10 @@ def shown(
             'kind': setting.kind,
             'low': low,
             'high': high,
-            'value': rounded(value)
-            if isinstance(value, float)
-            else value[:64]
-            if isinstance(value, str)
-            else value,
+            'value': value[:64] if isinstance(value, str) else rounded(value),
         }
         if setting.kind == 'choice':
-            row['choices'] = _choices(str(row['value']))
+            row['choices'] = list(dict.fromkeys([*_controllers()[:MAX_CHOICES], row['value']]))
         found.append(row)
     return found
 
@@ -214,7 +204,3 @@ def shown(
 def _controllers() -> tuple[str, ...]:
     # To find the installed ones takes many milliseconds.
     return tuple(controller_names())
-
-
-def _choices(value: str) -> list[str]:
-    return list(dict.fromkeys([*_controllers()[:MAX_CHOICES], value]))

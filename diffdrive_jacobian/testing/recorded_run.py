@@ -49,16 +49,13 @@ MAX_TOPICS = 8
 
 
 class RecordedRun:
-    """The recording of a test."""
+    """The recording of a test: the bag `run` in a directory, where it replaces an earlier one."""
 
     def __init__(self, world: Lockstep, directory: Path) -> None:
-        """Start to record all topics, as the bag `run` in a directory.
-
-        What an earlier run of the test left in the directory is replaced. Messages are recorded with
-        world time, so that their order remains where the clock of the nodes jumps back.
+        """Start to record all topics.
 
         Raises:
-            OSError: It cannot be written there.
+            OSError: The bag cannot be written.
         """
         self._directory = directory
         bag = directory / BAG
@@ -72,6 +69,7 @@ class RecordedRun:
         self._finished = False
         self._error: RecordingError | None = None
         self._kept: str | None = None
+        # With world time the order remains where the clock of the nodes jumps back.
         offset = world.now - world.world_time
         recorder = Recorder(
             Selection(everything=True), self._recording, now=lambda: offset + world.world_time
@@ -86,10 +84,9 @@ class RecordedRun:
         return self._recording.bag
 
     def finish(self) -> Path:
-        """End the recording and write the bag. Return its directory.
+        """End the recording and write the bag, which is deleted after the test. Return its directory.
 
-        It is deleted at the end of the test, unless it is kept. Messages after the first call are not
-        recorded. Later calls return or raise the same.
+        Messages after the first call are not recorded. Later calls return or raise the same.
 
         Raises:
             RecordingError: The recording is not complete.
@@ -105,10 +102,10 @@ class RecordedRun:
         return self.bag
 
     def keep(self) -> str:
-        """End the recording and keep it. Return the paths of the bag and of the figure, in two lines.
+        """End the recording as `finish` does and keep it, with a figure if there is odometry.
 
-        The figure needs odometry and matplotlib. Messages after the first call are not recorded. Later
-        calls return or raise the same.
+        Returns:
+            The paths of the bag and of the figure, in two lines.
 
         Raises:
             RecordingError: The recording is not complete.
@@ -154,16 +151,10 @@ class TopicDifference(NamedTuple):
 
 
 class Comparison:
-    """Comparison of a run with a golden one.
-
-    Identifiers (`unique_identifier_msgs/UUID`) are random, such as those of goals. They are equal if
-    each identifier of the run always stands for the same one of the golden run.
-    """
+    """Comparison of a run with a golden one; arguments as for `GoldenRun.check`."""
 
     def __init__(self, tolerance: float) -> None:
-        """Set the tolerance: the largest difference of two floats, relative to the smaller one if that
-        exceeds 1. Everything else must be equal, times included.
-        """
+        """Start without known identifiers."""
         self._tolerance = tolerance
         self._golden_of: dict[bytes, bytes] = {}
         self._run_of: dict[bytes, bytes] = {}
@@ -265,16 +256,11 @@ class GoldenRun:
     """The golden run of a test. It is checked when the test has passed, unless the test did so."""
 
     def __init__(self, run: RecordedRun, path: Path, test: str, update: bool) -> None:
-        """Compare a recorded run with a golden one.
+        """Compare a recorded run with the golden bag in a directory.
 
-        Args:
-            run: The recording of the test.
-            path: Directory of the golden bag.
-            test: Node id of the test.
-            update: Whether to write the golden bag if there is none, or if the run differs from it.
+        `update` writes that bag if there is none, or if the run of the test (node id) differs from it.
         """
-        self._run = run
-        self._update = update
+        self._run, self._update = run, update
         self.path = path
         """Directory of the golden bag."""
         self._command = f'pytest --update-golden-runs {shlex.quote(test)}'
@@ -292,7 +278,7 @@ class GoldenRun:
         Args:
             tolerance: Largest difference of two floats, relative to the smaller one if that exceeds 1.
                 Everything else must be equal, except identifiers (UUID), which are random: each one
-                must stand for one of the golden run.
+                must always stand for the same one of the golden run.
             without: Topics that are not compared, besides `/clock`, `/rosout`, `/parameter_events` and
                 `/tf`. Fully qualified names.
 

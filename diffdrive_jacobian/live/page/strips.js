@@ -6,7 +6,7 @@ const STRIPS = [
   { name: 'v', unit: 'm/s', curves: [['command_v', 'muted', 'set', true], ['v', 'v', 'v']] },
   { name: 'ω', unit: 'rad/s', curves: [['command_omega', 'muted', 'set', true], ['omega', 'omega', 'ω']] },
   { name: 'wheels', unit: 'rad/s', digits: 1, curves: [['left', 'left', 'L'], ['right', 'right', 'R']] },
-  { name: 'distance', unit: 'm', curves: [['distance', 'v', 'd']], zero: true, ofPath: false },
+  { name: 'distance', unit: 'm', curves: [['distance', 'v', 'd']], ofPath: false },
   { name: 'bearing error', unit: 'rad', curves: [['goal_heading_error', 'muted', 'Δθ', true], ['bearing_error', 'omega', 'e']], ofPath: false },
   { name: 'across path', unit: 'm', digits: 3, curves: [['across', 'v', 'left']], ofPath: true },
   { name: 'heading to path', unit: 'rad', curves: [['path_heading_error', 'omega', 'Δθ']], ofPath: true },
@@ -26,7 +26,7 @@ export class Strips {
       section.append(node);
       canvas.addEventListener('pointerdown', (event) => this.seek(event, canvas, onSeek));
       canvas.addEventListener('pointermove', (event) => { if (event.buttons) this.seek(event, canvas, onSeek); });
-      return { ...strip, node, canvas, values, span: 0 };
+      return { ...strip, node, canvas, values };
     });
   }
 
