@@ -83,16 +83,8 @@ class Access:
         """Choose the secrets."""
         self.token = secrets.token_urlsafe(24)
         """First part of every path."""
-        self._ticket = secrets.token_urlsafe(24)
-
-    @property
-    def opening_path(self) -> str:
-        """Path that redirects to the page, once.
-
-        A browser is started with it. Its command line can be read by other users of the machine, but is
-        worthless after the first use.
-        """
-        return f'/{OPEN}/{self._ticket}'
+        self.ticket = secrets.token_urlsafe(24)
+        """Second part of the path that redirects to the page, once."""
 
     def check(
         self, path: str, hosts: Sequence[str], origins: Sequence[str]
@@ -117,9 +109,9 @@ class Access:
         return ('socket', '') if origins else Refusal.ORIGIN
 
     def _use_ticket(self, ticket: str) -> bool:
-        valid = bool(self._ticket) and _same(ticket, self._ticket)
+        valid = bool(self.ticket) and _same(ticket, self.ticket)
         if valid:
-            self._ticket = ''
+            self.ticket = ''
         return valid
 
 
@@ -201,8 +193,11 @@ class LiveServer:
 
     @property
     def opening_url(self) -> str:
-        """Address that leads to the page once, for the command line of a browser."""
-        return f'http://{ADDRESS}:{self.port}{self.access.opening_path}'
+        """Address that leads to the page once.
+
+        It is for the command line of a browser, which other users of the machine can read.
+        """
+        return f'http://{ADDRESS}:{self.port}/{OPEN}/{self.access.ticket}'
 
     def close(self) -> None:
         """Disconnect all pages and end the thread."""

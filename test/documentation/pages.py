@@ -197,7 +197,7 @@ class Session:
     def _running(self, command: str) -> Iterator[None]:
         """Run a command, from its first output on. It has to exit with 0 when it is interrupted."""
         with tempfile.TemporaryFile(mode='w+') as file:
-            process = self._start(['bash', '-c', f'exec {command}'], file)
+            process, passed = self._start(['bash', '-c', f'exec {command}'], file), False
             try:
                 deadline = time.monotonic() + PATIENCE
                 while os.fstat(file.fileno()).st_size == 0:
@@ -205,6 +205,7 @@ class Session:
                     assert time.monotonic() < deadline, f'{command} printed nothing'
                     time.sleep(0.01)
                 yield
+                passed = True
             finally:
                 process.send_signal(signal.SIGINT)
                 try:
@@ -213,7 +214,8 @@ class Session:
                     process.kill()
                     code = process.wait()
                 file.seek(0)
-                print(f'{command}: exit code {code}\n{file.read()}')
+                if code or not passed:
+                    print(f'{command}: exit code {code}\n{file.read()}')
             assert code == 0, f'{command}: exit code {code}'
 
     def _edit(self, name: str, words: str, replacement: str) -> None:
