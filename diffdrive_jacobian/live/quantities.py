@@ -9,11 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.control import Arrival
-from diffdrive_jacobian.kinematics.diff_drive import (
-    body_to_wheel_jacobian,
-    unicycle_jacobian,
-    wheel_to_body_jacobian,
-)
+from diffdrive_jacobian.kinematics import diff_drive
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 
 Array = NDArray[np.float64]
@@ -84,12 +80,12 @@ def chain(
         Matrices and vectors. `measured` says whether the second half follows from measured wheel speeds.
     """
     scale = np.array(radius_multipliers)
-    inverse, forward = body_to_wheel_jacobian(*geometry), wheel_to_body_jacobian(*geometry)
-    inverse, forward = inverse / scale[:, np.newaxis], forward * scale
+    inverse = diff_drive.body_to_wheel_jacobian(*geometry) / scale[:, np.newaxis]
+    forward = diff_drive.wheel_to_body_jacobian(*geometry) * scale
     wanted = inverse @ np.array(command)
     wheels = wanted if measured is None else np.array(measured)
     twist = forward @ wheels
-    jacobian = unicycle_jacobian(theta)
+    jacobian = diff_drive.unicycle_jacobian(theta)
     return {
         'command': rounded(command),
         'inverse': rounded(inverse),

@@ -201,7 +201,6 @@ class LiveServer:
 
     def close(self) -> None:
         """Disconnect all pages and end the thread."""
-        self._session.closed = True
         # The loop is closed if the thread has ended.
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._closing.set)

@@ -23,6 +23,13 @@ Range = tuple[float, float]
 """Smallest and largest value."""
 MAX_CHOICES = 32
 """Largest number of controllers that are offered."""
+TYPES: dict[str, type[float | str | bool]] = {
+    'number': float,
+    'limit': float,
+    'choice': str,
+    'flag': bool,
+}
+"""Type of the values of each kind of setting."""
 TAKES_TIME = 'Time to follow commands'
 
 
@@ -67,14 +74,9 @@ class Setting:
         Raises:
             SettingError: It is of another type.
         """
-        if self.kind == 'choice' and isinstance(value, str):
+        value = math.nan if self.kind == 'limit' and value is None else value
+        if isinstance(value, TYPES[self.kind]):
             return value
-        if self.kind == 'flag' and isinstance(value, bool):
-            return value
-        if self.kind in ('number', 'limit') and isinstance(value, float):
-            return value
-        if self.kind == 'limit' and value is None:
-            return math.nan
         raise SettingError(f'{self.name} cannot be {printable(repr(value), 40)}')
 
 
@@ -179,8 +181,7 @@ def shown(
     found = []
     for setting in offered(gains):
         value = values.get(setting.role, {}).get(setting.name)
-        expected = {'choice': str, 'flag': bool}.get(setting.kind, float)
-        if not isinstance(value, expected):
+        if not isinstance(value, TYPES[setting.kind]):
             continue
         low, high = setting.slider(ranges.get(setting.role, {}).get(setting.name))
         row = {

@@ -16,7 +16,7 @@ from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.bags.time_series import commanded, limits, line, measured
 from diffdrive_jacobian.bags.timeline import Array, Timeline, jumps, seconds, timeline, tolerance
 from diffdrive_jacobian.messages.topics import SENSORS
-from diffdrive_jacobian.plots.output_files import FORMATS, create
+from diffdrive_jacobian.plots.output_files import FORMATS, create, extension
 from diffdrive_jacobian.plots.rendering import render, styled
 from diffdrive_jacobian.plots.uncertainty import distance_travelled, draw_uncertainty, uncertainty_marks
 from diffdrive_jacobian.text import printable
@@ -127,7 +127,7 @@ def draw(
         OSError: The file cannot be written.
         ValueError: The path has another ending.
     """
-    ending = path.suffix.lower().removeprefix('.')
+    ending = extension(path)
     if ending not in FORMATS:
         raise ValueError(f'{path} must end in .{", .".join(FORMATS)}')
     if path.exists() and not replace:
