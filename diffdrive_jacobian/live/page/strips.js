@@ -21,7 +21,8 @@ export class Strips {
     this.strips = STRIPS.map((strip) => {
       const canvas = element('canvas', { role: 'img', 'aria-label': `${strip.name} over time` });
       const values = strip.curves.map(([, color]) => element('span', { class: color === 'muted' ? 'unit' : color }));
-      const node = element('div', { class: 'strip' },
+      // Without a path, as at the start: the map must not change its size after it is shown.
+      const node = element('div', { class: 'strip', hidden: strip.ofPath === true },
         element('p', {}, element('span', { class: 'name' }, strip.name, ' ', element('span', { class: 'unit' }, strip.unit)), ...values), canvas);
       section.append(node);
       canvas.addEventListener('pointerdown', (event) => this.seek(event, canvas, onSeek));
