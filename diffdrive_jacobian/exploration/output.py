@@ -22,8 +22,7 @@ from diffdrive_jacobian.exploration.result import LONGEST_KEY, Finding
 from diffdrive_jacobian.exploration.scenario import ExplorationError, Source
 from diffdrive_jacobian.exploration.trial import Setting, Trial, run
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.plots.fault_marks import ViolationMark
-from diffdrive_jacobian.plots.run_figure import draw
+from diffdrive_jacobian.plots.run_figure import ViolationMark, draw
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.text import error_text, printable

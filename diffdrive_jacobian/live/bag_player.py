@@ -1,10 +1,11 @@
-"""A bag as a source of the page: time that plays, pauses and jumps."""
+"""A bag as a source of the page: time that plays, pauses and jumps. No ROS is needed."""
 
 from __future__ import annotations
 
 import time
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.timeline import jumps
+from diffdrive_jacobian.bags.bag_reader import BagError, open_bag
+from diffdrive_jacobian.bags.run import Run, Series
+from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.timeline import jumps, seconds, timeline
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
 from diffdrive_jacobian.live.quantities import rounded
-from diffdrive_jacobian.live.recorded_runs import RecordedRobot
 from diffdrive_jacobian.live.robot_state import MAX_POINTS, TRUTH_LIFE, RobotState, Trail
+from diffdrive_jacobian.live.server import LiveServer, Ready
 from diffdrive_jacobian.live.session import Session, Snapshot
+from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.covariances import from_covariance
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.messages.topics import SENSORS
+from diffdrive_jacobian.messages.names import base_name, namespace_of
+from diffdrive_jacobian.messages.topics import SENSORS, TOPICS
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 Array = NDArray[np.float64]
 PERIOD = 1.0 / 30.0
@@ -32,6 +41,31 @@ COMMAND_LIFE, WHEELS_LIFE = 0.5, 1.0
 """Time for which a recorded cmd_vel and joint_states count (s)."""
 STRIP_POINTS = 1500
 """Largest number of points of a curve over time."""
+MAX_ROBOTS = 16
+"""Largest number of robots that are shown."""
+
+
+def watch_bag(path: Path, *, port: int, speed: float, signals: Signals, ready: Ready) -> None:
+    """Play a bag on the page.
+
+    Args:
+        path: The bag.
+        port: TCP port. 0: any free one.
+        speed: Speed at the start.
+        signals: Counter of the signals that end it.
+        ready: Receives the server when it answers.
+
+    Raises:
+        BagError: It is not a bag, is damaged, or has no odometry.
+        OSError: The port is in use.
+    """
+    session = Session()
+    player = BagPlayer(session, path, read_robots(path), speed=speed)
+    with closing(LiveServer(session, port)) as server:
+        ready(server)
+        while not signals.count:
+            player.work()
+            time.sleep(PERIOD)
 
 
 class BagPlayer:
@@ -40,16 +74,8 @@ class BagPlayer:
     def __init__(
         self, session: Session, path: Path, robots: Sequence[RecordedRobot], *, speed: float = 1.0
     ) -> None:
-        """Start at the beginning, playing.
-
-        Args:
-            session: What the page shows, and where its commands come from.
-            path: The bag, for its name.
-            robots: Its robots, at least one.
-            speed: Speed relative to the clock on the wall.
-        """
-        self._session = session
-        self._films = [_Film(robot) for robot in robots]
+        """Start at the beginning of a bag, at a speed relative to the clock on the wall."""
+        self._session, self._robots = session, robots
         self._end = max(float(robot.time[-1]) for robot in robots)
         self.time, self.speed, self.paused = 0.0, speed, False
         """Present time (s), speed, and whether it stands."""
@@ -57,9 +83,9 @@ class BagPlayer:
         self._shown: object = None
         self._fixed = {
             'bag': path.name,
-            'strips': {film.robot.name: film.strips() for film in self._films},
-            'settings': {film.robot.name: film.settings() for film in self._films},
-            'notes': [note for film in self._films for note in film.robot.run.notes][:5],
+            'strips': {robot.name: robot.strips() for robot in robots},
+            'settings': {robot.name: robot.settings() for robot in robots},
+            'notes': [note for robot in robots for note in robot.run.notes][:5],
         }
 
     def work(self) -> None:
@@ -81,9 +107,9 @@ class BagPlayer:
         self._shown = state
         self._session.store(
             Snapshot(
-                robots=[film.shown(self.time) for film in self._films],
-                trails={film.robot.name: film.trail for film in self._films},
-                true_trails={film.robot.name: film.true_trail for film in self._films},
+                robots=[robot.shown(self.time) for robot in self._robots],
+                trails={robot.name: robot.trail for robot in self._robots},
+                true_trails={robot.name: robot.true_trail for robot in self._robots},
                 world={
                     'kind': 'bag',
                     'time': round(self.time, 3),
@@ -102,7 +128,7 @@ class BagPlayer:
                 self.time = 0.0
         elif isinstance(command, Step):
             self.paused = True
-            self.time = min([film.next(self.time) for film in self._films] + [self._end])
+            self.time = min([robot.next(self.time) for robot in self._robots] + [self._end])
         elif isinstance(command, SetSpeed):
             self.speed = command.speed
         elif isinstance(command, Seek):
@@ -111,75 +137,91 @@ class BagPlayer:
             self._session.notify('this is a recording: it cannot be steered', 'warning')
 
 
-def _trail(times: Array, poses: Array, breaks: NDArray[np.intp]) -> tuple[Trail, list[float]]:
-    """Return a path with a bounded number of points, and the time of each (s).
+# --- Robots
 
-    Args:
-        times: Time of each pose, shape (n,) (s).
-        poses: `[x, y, ...]`, shape (n, k) (m).
-        breaks: Indices of the poses before which the path is interrupted.
+
+def read_robots(path: Path) -> list[RecordedRobot]:
+    """Read all robots of a bag.
+
+    Raises:
+        BagError: It is not a bag, is damaged, or has no odometry.
     """
-    trail, at = Trail(), []
-    step = max(1, len(times) // MAX_POINTS)
-    broken = set(breaks.tolist())
-    for index in range(0, len(times), step):
-        if any(one in broken for one in range(index - step + 1, index + 1)) and trail.points:
-            trail.points.append(None)
-            at.append(float(times[index]))
-        x, y = poses[index, :2].tolist()
-        trail.points.append((round(x, 4), round(y, 4)))
-        at.append(float(times[index]))
-    return trail, at
+    with open_bag(path) as reader:
+        topics = {one.topic for one in reader.connections if one.msgtype in TOPICS['odom'].types}
+    namespaces = sorted({namespace_of(topic) for topic in topics if base_name(topic) == 'odom'})
+    if len(namespaces) > MAX_ROBOTS:
+        raise BagError(f'{path} has {len(namespaces)} robots, at most {MAX_ROBOTS} can be shown')
+    runs, notes = {}, list[str]()
+    for namespace in namespaces:
+        # The other topics of a single robot may have another namespace.
+        run = read_run(path, namespace=namespace if len(namespaces) > 1 else None)
+        if len(run.odometry):
+            runs[namespace] = run
+        notes += run.notes
+    if not runs:
+        why = f'no valid message on a topic odom of {TOPICS["odom"].types[0]}'
+        raise BagError('; '.join([f'{path} has no odometry: {why}', *notes]))
+    first = min(run.odometry.stamps[0] for run in runs.values())
+    return [
+        RecordedRobot(namespace, run, float(run.odometry.stamps[0] - first) / NANOSECONDS)
+        for namespace, run in runs.items()
+    ]
 
 
-class _Film:
-    """One robot of a bag, at any time."""
+class RecordedRobot:
+    """One robot of a bag, at any time. Times are seconds since the first odometry of the bag."""
 
-    def __init__(self, robot: RecordedRobot) -> None:
-        self.robot, run = robot, robot.run
-        self._state = RobotState(robot.name)
+    def __init__(self, name: str, run: Run, start: float) -> None:
+        """Take a run of a namespace whose first odometry has the time `start` (s)."""
+        self.name, self.run, self.start = name, run, start
+        self._line = timeline(run)
+        self.time = np.maximum.accumulate(self._line.time + start)
+        """Of each odometry, shape (n,) (s), never decreasing."""
+        self._covariance = _covariances(run)
+        self._state = RobotState(name)
         self._configurations = list(run.configurations())
         self._configure(0)
-        self._commands, self._wheels = robot.times(run.cmd_vel), robot.times(run.wheels)
-        self._statuses = robot.run.goal_status.received
-        self._sensors = {topic: robot.times(getattr(run, topic.series)) for topic in SENSORS}
-        self._truths = np.maximum.accumulate(robot.times(run.ground_truth))
-        self.trail, self._trail_times = _trail(robot.time, run.odometry.values, robot.timeline.breaks)
+        self._commands, self._wheels = self._times(run.cmd_vel), self._times(run.wheels)
+        self._sensors = {topic: self._times(getattr(run, topic.series)) for topic in SENSORS}
+        self._truths = np.maximum.accumulate(self._times(run.ground_truth))
+        self.trail, self._trail_times = _trail(self.time, run.odometry.values, self._line.breaks)
         self.true_trail, self._true_times = _trail(
             self._truths, run.ground_truth.values, jumps(run.ground_truth)
         )
 
+    def _times(self, series: Series) -> Array:
+        """Return the times of messages, shape (n,) (s)."""
+        return seconds(self.run, series) + self.start
+
     def next(self, time: float) -> float:
         """Return the time of the next odometry (s)."""
-        index = int(np.searchsorted(self.robot.time, time + 1e-9, side='right'))
-        return float(self.robot.time[index]) if index < len(self.robot.time) else time + STEP
+        index = _count(self.time, time + 1e-9)
+        return float(self.time[index]) if index < len(self.time) else time + STEP
 
     def shown(self, time: float) -> dict[str, Any]:
         """Return the JSON object of the robot at a time (s)."""
-        robot, run, state = self.robot, self.robot.run, self._state
-        index = robot.index(time)
+        run, state = self.run, self._state
+        index = max(0, _count(self.time, time) - 1)
         self._configure(int(run.odometry.received[index]))
-        values = run.odometry.values[index]
-        state.time = float(robot.time[index])
-        state.pose, state.twist = values[:3], (float(values[3]), float(values[4]))
-        state.covariance = robot.covariance[index]
-        state.command = robot.latest(self._commands, run.cmd_vel, time, COMMAND_LIFE)
-        state.wheels = robot.latest(self._wheels, run.wheels, time, WHEELS_LIFE)
+        *pose, v, omega = run.odometry.values[index].tolist()
+        state.time = float(self.time[index])
+        state.pose, state.twist = np.array(pose), (v, omega)
+        state.covariance = self._covariance[index]
+        state.command = _latest(self._commands, run.cmd_vel, time, COMMAND_LIFE)
+        state.wheels = _latest(self._wheels, run.wheels, time, WHEELS_LIFE)
+        state.readings = {}
         for topic, times in self._sensors.items():
-            latest = int(np.searchsorted(times, time, side='right')) - 1
-            values = getattr(run, topic.series).values[latest].tolist() if latest >= 0 else []
-            state.readings.update(zip(topic.columns, values, strict=False))
+            if latest := _count(times, time):
+                values = getattr(run, topic.series).values[latest - 1].tolist()
+                state.readings.update(zip(topic.columns, values, strict=True))
         self._set_goal(index)
-        latest = int(np.searchsorted(self._truths, time, side='right')) - 1
+        latest = _count(self._truths, time) - 1
         known = latest >= 0 and time - self._truths[latest] < TRUTH_LIFE
         state.truth = run.ground_truth.values[latest, :3] if known else None
-        travelled, truly = (
-            int(np.searchsorted(times, time, side='right'))
-            for times in (self._trail_times, self._true_times)
-        )
-        age = max(0.0, time - state.time)
-        shown = state.shown(age=age, by_hand=False, travelled=travelled, truly_travelled=truly)
+        shown = state.shown(age=max(0.0, time - state.time), by_hand=False)
         assert shown is not None
+        shown['travelled'] = _count(self._trail_times, time)
+        shown['truly_travelled'] = _count(self._true_times, time)
         return shown
 
     def _configure(self, received: int) -> None:
@@ -190,10 +232,9 @@ class _Film:
         self._state.robot_values = run.of_node('virtual_robot')
 
     def _set_goal(self, index: int) -> None:
-        run, line, goal = self.robot.run, self.robot.timeline, self._state.goal
+        run, line, goal = self.run, self._line, self._state.goal
         if line.path[index] >= 0:
-            path = line.paths[line.path[index]]
-            goal.replay(path, 0, GoalState.EXECUTING)
+            goal.replay(line.paths[line.path[index]], 0, GoalState.EXECUTING)
             assert goal.path is not None
             goal.path.s, goal.path.across = float(line.progress[index]), float(line.across[index])
             goal.path.heading = float(line.path_heading_error[index])
@@ -202,28 +243,26 @@ class _Film:
         if number < 0:
             goal.replay(None, 0, GoalState.UNKNOWN)
             return
-        stamp = run.goals.received[number]
-        route = np.flatnonzero(run.goals.received == stamp)
+        route = np.flatnonzero(run.goals.received == run.goals.received[number])
         reached = bool(np.isnan(line.bearing_error[index]))
         state = GoalState.SUCCEEDED if reached else GoalState.EXECUTING
         goal.replay(run.goals.values[route], int(np.searchsorted(route, number)), state)
 
     def settings(self) -> list[dict[str, Any]]:
         """Return the recorded parameters that the page shows."""
-        state = self._state
+        values = self._state.controller_values
         # Of another package it may be missing here, or a later one.
-        controller = BUILT_IN.get(str(state.controller_values.get('controller', '')))
-        values = state.controller_values
+        controller = BUILT_IN.get(str(values.get('controller', '')))
         return settings.shown(
-            {'controller': values, 'robot': state.robot_values},
+            {'controller': values, 'robot': self._state.robot_values},
             controller.gains if controller else settings.recorded_gains(values),
         )
 
     def strips(self) -> Mapping[str, Any]:
         """Return the curves over the whole bag."""
-        robot, run, line = self.robot, self.robot.run, self.robot.timeline
-        chosen = np.unique(np.linspace(0, len(robot.time) - 1, STRIP_POINTS).astype(np.intp))
-        at = robot.time[chosen]
+        run, line = self.run, self._line
+        chosen = np.unique(np.linspace(0, len(self.time) - 1, STRIP_POINTS).astype(np.intp))
+        at = self.time[chosen]
         curves: dict[str, Array] = {
             'time': at,
             'v': run.odometry.values[chosen, 3],
@@ -246,3 +285,43 @@ class _Film:
                 curve[(index < 0) | (at - times[np.maximum(index, 0)] > COMMAND_LIFE)] = np.nan
                 curves[name] = curve
         return {name: rounded(curve) for name, curve in curves.items()}
+
+
+def _count(times: Array, time: float) -> int:
+    """Return how many of ascending times are not later than a time."""
+    return int(np.searchsorted(times, time, side='right'))
+
+
+def _latest(times: Array, series: Series, time: float, life: float) -> tuple[float, float] | None:
+    """Return the last values of a series of pairs at a time (s). None: older than `life` (s)."""
+    index = _count(times, time) - 1
+    if index < 0 or time - times[index] > life:
+        return None
+    first, second = series.values[index, :2].tolist()
+    return first, second
+
+
+def _covariances(run: Run) -> Array:
+    """Return the covariance of the pose at each odometry, shape (n, 3, 3); zero where it is invalid."""
+    matrices = run.odometry_covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    for matrix in matrices:
+        try:
+            matrix[:] = from_covariance(matrix)
+        except MessageError:
+            matrix[:] = 0.0
+    return matrices
+
+
+def _trail(times: Array, poses: Array, breaks: NDArray[np.intp]) -> tuple[Trail, Array]:
+    """Return a path with a bounded number of points, interrupted before some, and their times (s)."""
+    trail, at = Trail(), list[float]()
+    step = max(1, len(times) // MAX_POINTS)
+    broken = set(breaks.tolist())
+    for index in range(0, len(times), step):
+        if trail.points and not broken.isdisjoint(range(index - step + 1, index + 1)):
+            trail.points.append(None)
+            at.append(float(times[index]))
+        x, y = poses[index, :2].tolist()
+        trail.points.append((round(x, 4), round(y, 4)))
+        at.append(float(times[index]))
+    return trail, np.array(at)

@@ -19,10 +19,8 @@ MAX_SIZE = 4096
 """Largest size of a command (bytes)."""
 MAX_TEXT = 256
 """Largest length of a text in a command (characters)."""
-MAX_WORLD_SPEED = 1000.0
-"""Largest speed of simulated time or of a bag, relative to the clock on the wall."""
-MIN_WORLD_SPEED = 0.01
-"""Smallest such speed."""
+MIN_WORLD_SPEED, MAX_WORLD_SPEED = 0.01, 1000.0
+"""Speeds of simulated time or of a bag, relative to the clock on the wall."""
 
 
 class CommandError(DiffdriveError, ValueError):
@@ -52,10 +50,22 @@ _Velocity = Annotated[float, between(-MAX_SPEED, MAX_SPEED)]
 
 
 @dataclass(frozen=True, slots=True)
-class SendGoal(Checked):
-    """Send a goal to a robot."""
+class Command(Checked):
+    """A command of the page."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotCommand(Command):
+    """A command for one robot."""
 
     robot: _Text
+    """Its namespace."""
+
+
+@dataclass(frozen=True, slots=True)
+class SendGoal(RobotCommand):
+    """Send a goal."""
+
     x: _Position
     y: _Position
     theta: Annotated[float | None, optional(_angle)]
@@ -64,58 +74,43 @@ class SendGoal(Checked):
     """Whether it is a further waypoint after the present goals."""
 
 
-@dataclass(frozen=True, slots=True)
-class CancelGoal(Checked):
-    """Cancel the goal of a robot."""
-
-    robot: _Text
+class CancelGoal(RobotCommand):
+    """Cancel the goal."""
 
 
 @dataclass(frozen=True, slots=True)
-class DriveByHand(Checked):
-    """Drive a robot by hand. It must be repeated, otherwise the robot stops."""
+class DriveByHand(RobotCommand):
+    """Drive by hand. It must be repeated, otherwise the robot stops."""
 
-    robot: _Text
     v: _Velocity
     omega: _Velocity
 
 
-@dataclass(frozen=True, slots=True)
-class Release(Checked):
+class Release(RobotCommand):
     """End driving by hand: the robot stops."""
 
-    robot: _Text
-
 
 @dataclass(frozen=True, slots=True)
-class Place(Checked):
-    """Set the pose of a robot."""
+class Place(RobotCommand):
+    """Set the pose of the robot."""
 
-    robot: _Text
     x: _Position
     y: _Position
     theta: Annotated[float, _angle]
 
 
-@dataclass(frozen=True, slots=True)
-class Reset(Checked):
-    """Reset the odometry of a robot to its initial pose."""
-
-    robot: _Text
+class Reset(RobotCommand):
+    """Reset the odometry to the initial pose."""
 
 
-@dataclass(frozen=True, slots=True)
-class ClearPath(Checked):
-    """Forget the path of a robot that the page draws."""
-
-    robot: _Text
+class ClearPath(RobotCommand):
+    """Forget the path that the page draws."""
 
 
 @dataclass(frozen=True, slots=True)
-class SetParameter(Checked):
+class SetParameter(RobotCommand):
     """Set a parameter of a node."""
 
-    robot: _Text
     parameter: _Text
     """Name of the parameter on the page, `ROLE/NAME`."""
     value: Annotated[float | str | bool | None, _setting]
@@ -123,48 +118,31 @@ class SetParameter(Checked):
 
 
 @dataclass(frozen=True, slots=True)
-class Pause(Checked):
+class Pause(Command):
     """Stop or continue simulated time, or a bag."""
 
     paused: _Flag
 
 
-@dataclass(frozen=True, slots=True)
-class Step(Checked):
+class Step(Command):
     """Advance by one time step, and pause."""
 
 
 @dataclass(frozen=True, slots=True)
-class SetSpeed(Checked):
+class SetSpeed(Command):
     """Set the speed of simulated time, or of a bag."""
 
     speed: Annotated[float, between(MIN_WORLD_SPEED, MAX_WORLD_SPEED)]
 
 
 @dataclass(frozen=True, slots=True)
-class Seek(Checked):
+class Seek(Command):
     """Go to a time of the bag (s)."""
 
     time: Annotated[float, between(0.0, 1e9, unit='s')]
 
 
-Command = (
-    SendGoal
-    | CancelGoal
-    | DriveByHand
-    | Release
-    | Place
-    | Reset
-    | ClearPath
-    | SetParameter
-    | Pause
-    | Step
-    | SetSpeed
-    | Seek
-)
-
-
-_KINDS: dict[str, type[Any]] = {
+_KINDS: dict[str, type[Command]] = {
     'goal': SendGoal,
     'cancel': CancelGoal,
     'drive': DriveByHand,
@@ -203,10 +181,9 @@ def parse(text: str | bytes) -> Command:
         keys = ', '.join(names) or 'of no value'
         raise CommandError(f'{name} must have the keys {keys}, got {short(list(content), repr)}')
     try:
-        command: Command = kind(**content)
+        return kind(**content)
     except ValueError as error:
         raise CommandError(str(error)) from None
-    return command
 
 
 def _refuse_constant(name: str) -> NoReturn:

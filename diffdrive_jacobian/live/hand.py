@@ -1,8 +1,7 @@
-"""Driving by hand, with a dead-man's switch: who stops asking stops the robot.
+"""Driving by hand, with a dead-man's switch: a page that stops asking stops the robot.
 
-A pure state machine. The page is watched by a monotonic clock; commands are spaced by the robot's, which
-may be simulated and fast. While a goal is active, driving by hand first cancels it and begins when that
-is confirmed.
+The page is watched by a monotonic clock; commands are spaced by the robot's, which may be simulated. An
+active goal is canceled first, and driving begins when that is confirmed.
 """
 
 from __future__ import annotations
@@ -62,13 +61,9 @@ class HandDriving:
     def update(
         self, now: float, robot_time: float, is_open: Callable[[int], bool], goal_active: bool
     ) -> Act:
-        """Return what must be done now; to be called often.
+        """Return what must be done now (s, and by the robot's clock); to be called often.
 
-        Args:
-            now: Present time (s).
-            robot_time: The same by the robot's clock (s).
-            is_open: Whether a page is connected.
-            goal_active: Whether a controller drives the robot.
+        `is_open` tells whether a page is connected, `goal_active` that a controller drives the robot.
         """
         if self.page is None:
             return Act.NOTHING

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import Gain, Path
@@ -27,10 +30,8 @@ from diffdrive_jacobian.live.commands import (
     SendGoal,
     SetParameter,
 )
-from diffdrive_jacobian.live.goal_progress import GoalEnd
 from diffdrive_jacobian.live.hand import STANDSTILL, Act, HandDriving
-from diffdrive_jacobian.live.parameter_link import PATIENCE, ParameterLink
-from diffdrive_jacobian.live.robot_state import RobotState
+from diffdrive_jacobian.live.robot_state import GoalEnd, RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
 from diffdrive_jacobian.live.session import Session
 from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, PATH, POSE, Motion, Route, Status
@@ -42,10 +43,13 @@ from diffdrive_jacobian.nodes.remote_goal import ignores_heading
 from diffdrive_jacobian.nodes.stopping import rolls_on
 from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
-from diffdrive_jacobian.ros.service_client import ServiceClient
+from diffdrive_jacobian.recording.parameter_query import ParameterQuery
+from diffdrive_jacobian.ros.service_client import ServiceClient, ignore
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS, seconds
 
+PATIENCE = 3.0
+"""Longest wait for the answer of a node (s)."""
 COMMAND_LIFE = 0.5
 """Time for which a cmd_vel is shown after it was received (s)."""
 ANSWER_PATIENCE = 1.0
@@ -55,6 +59,68 @@ SERVICES = {
     'reset_odometry': 'the odometry cannot be reset',
 }
 """Services of a robot, and what it means if they fail."""
+
+
+class ParameterLink:
+    """Reads and sets parameters of one node."""
+
+    def __init__(self, node: Node, target: str) -> None:
+        """Query the values of the node with a fully qualified name."""
+        self.target = target
+        self.values: dict[str, Any] = {}
+        """Values by name, as far as they are known."""
+        self.ranges: dict[str, settings.Range] = {}
+        """Ranges of doubles by name, as far as their descriptors have one."""
+        self._known: set[str] = set()
+        self._undescribed: list[str] = []
+        self._query = ParameterQuery(node, target, self.changed, ignore)
+        client = partial(ServiceClient, node, patience=PATIENCE, server=printable(target))
+        self._describe = client(DescribeParameters, f'{target}/describe_parameters')
+        self._set = client(SetParameters, f'{target}/set_parameters')
+
+    def advance(self) -> None:
+        """Ask, and check for answers that are late; to be called often."""
+        self._query.advance()
+        if self._undescribed and self._describe.ready:
+            names, self._undescribed = self._undescribed, []
+            request = DescribeParameters.Request(names=names)
+            self._describe.call(request, partial(self._on_descriptors, names), ignore)
+        self._describe.advance()
+        self._set.advance()
+
+    def destroy(self) -> None:
+        """Destroy the clients. Who waits for an answer gets a refusal."""
+        for client in (self._query, self._describe, self._set):
+            client.destroy()
+
+    def changed(self, values: Mapping[str, Any]) -> None:
+        """Take values from the node itself or from a parameter event."""
+        self.values.update(values)
+        new = [name for name, value in values.items() if isinstance(value, float)]
+        self._undescribed += [name for name in new if name not in self._known]
+        self._known.update(new)
+
+    def set(self, name: str, value: float | str | bool, on_refusal: Callable[[str], object]) -> None:
+        """Set a parameter. `on_refusal` receives the reason if the node does not accept it."""
+
+        def on_response(response: Any) -> None:
+            result = next(iter(response.results), None)
+            if result is None:
+                on_refusal('its answer cannot be read')
+            elif result.successful:
+                self.values[name] = value
+            else:
+                on_refusal(printable(result.reason, 300))
+
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        self._set.call(SetParameters.Request(parameters=[parameter]), on_response, on_refusal)
+
+    def _on_descriptors(self, names: list[str], response: Any) -> None:
+        # A node that lacks one of the parameters sends no descriptors at all.
+        for name, descriptor in zip(names, response.descriptors, strict=False):
+            for one in descriptor.floating_point_range[:1]:
+                if -math.inf < one.from_value < one.to_value < math.inf:
+                    self.ranges[name] = one.from_value, one.to_value
 
 
 class LiveRobot:
@@ -76,7 +142,7 @@ class LiveRobot:
             node: The node that subscribes.
             session: Receives notices.
             namespace: Namespace of the robot, `/` or `/NAME`.
-            names: Names of topics without namespace, from the usual ones.
+            names: As for `RobotTopics`.
             polled: As for `Latest`.
             clock: Returns the time in which the robot publishes (s): simulated time may stand.
 
@@ -90,15 +156,14 @@ class LiveRobot:
         self.topics.listen(POSE, 'goal_pose', self._on_goals, latched=False)
         self.topics.listen(GOALS, 'goals', self._on_goals, latched=False)
         self.topics.listen(PATH, 'path', self._on_path, latched=False)
-        self.topics.prepare()
         self.links: dict[str, ParameterLink] = {}
         """Parameters by role."""
         self.hand = HandDriving()
         # Before they are needed, so that they are discovered by then.
-        self._services = {}
-        for name in SERVICES:
-            full = self.topics.full(name)
-            self._services[name] = ServiceClient(node, Trigger, full, patience=PATIENCE, server=full)
+        self._services = {
+            name: ServiceClient(node, Trigger, full, patience=PATIENCE, server=full)
+            for name, full in ((name, self.topics.full(name)) for name in SERVICES)
+        }
         self._frame = ''
         self._seen = self._commanded = clock()
         self._sent, self._stamp = -math.inf, 0
@@ -145,8 +210,7 @@ class LiveRobot:
         self.state.moved(seconds(motion.stamp), np.array(motion.pose), motion.twist, covariance)
 
     def _on_goals(self, route: Route) -> None:
-        goals = np.array(route.poses, dtype=np.float64)
-        self.state.goal.sent(goals.reshape(-1, 3), route.stamp)
+        self.state.goal.sent(np.reshape(route.poses, (-1, 3)), route.stamp)
 
     def _on_path(self, route: Route) -> None:
         # One that is no path is refused by the controller.
@@ -164,9 +228,7 @@ class LiveRobot:
             self.poll()
             self.on_end(self.state.goal_end(changed))
         if changed.state is GoalState.ABORTED:
-            self._session.notify(
-                'the controller refused or aborted the goal: its log says why', 'warning'
-            )
+            self._warn('the controller refused or aborted the goal: its log says why')
 
     # --- Commands of the page
 
@@ -176,7 +238,7 @@ class LiveRobot:
             self._send_goal(command)
         elif isinstance(command, DriveByHand):
             if not self.hand.command(page, (command.v, command.omega), time.monotonic()):
-                self._session.notify('another page drives this robot by hand', 'warning')
+                self._warn('another page drives this robot by hand')
         elif isinstance(command, Release):
             self.hand.release(page)
         elif isinstance(command, CancelGoal):
@@ -185,12 +247,12 @@ class LiveRobot:
             self._call('reset_odometry')
             self.state.interrupt()
         elif isinstance(command, Place):
-            if not self.topics.readers('initialpose'):
-                self._warn(f'nobody is subscribed to {self.topics.full("initialpose")}: not placed')
-            else:
+            if self.topics.readers('initialpose'):
                 pose = np.array([command.x, command.y, command.theta])
                 self.topics.publish_pose(pose, self._frame, self._now())
                 self.state.interrupt()
+            else:
+                self._warn(f'nobody is subscribed to {self.topics.full("initialpose")}: not placed')
         elif isinstance(command, ClearPath):
             self.state.clear_path()
         elif isinstance(command, SetParameter):
@@ -265,12 +327,8 @@ class LiveRobot:
 
     def drive(self) -> None:
         """Drive by hand, if a page does; to be called often."""
-        act = self.hand.update(
-            time.monotonic(),
-            self._now() / NANOSECONDS,
-            self._session.is_open,
-            self.state.goal.active,
-        )
+        clocks = time.monotonic(), self._now() / NANOSECONDS
+        act = self.hand.update(*clocks, self._session.is_open, self.state.goal.active)
         if act is Act.PUBLISH:
             self.topics.publish_twist(self.hand.twist, self._now())
         elif act is Act.STOP:
@@ -285,9 +343,8 @@ class LiveRobot:
 
     def _rolls_on(self) -> str:
         """Describe how far the robot rolls after zero was sent, as far as its limits are known."""
-        link = self.links.get('robot')
         try:
-            model = from_ros(VirtualRobotParameters, link.values if link else {}).model()
+            model = from_ros(VirtualRobotParameters, self.state.robot_values).model()
         except ParameterError:
             # The robot is another node, with parameters of the same names.
             return ''
@@ -335,12 +392,8 @@ class LiveRobot:
         """Advance queries of parameters."""
         for service in self._services.values():
             service.advance()
-        for role, link in self.links.items():
+        for link in self.links.values():
             link.advance()
-            if role == 'robot':
-                self.state.robot_values = link.values
-            else:
-                self.state.controller_values = link.values
 
     def shown(self) -> dict[str, Any] | None:
         """Return the JSON object for the page."""
@@ -354,8 +407,7 @@ class LiveRobot:
 
     def _gains(self) -> tuple[Gain, ...]:
         """Return the gains of the controller that is chosen."""
-        link = self.links.get('controller')
-        return settings.gains(str(link.values.get('controller', ''))) if link else ()
+        return settings.gains(str(self.state.controller_values.get('controller', '')))
 
     def destroy(self) -> None:
         """Destroy all entities."""
@@ -369,7 +421,12 @@ class LiveRobot:
         """Take the nodes that have the parameters, by role."""
         for role, name in found.items():
             link = self.links.get(role)
-            if link is not None and link.target != name:
+            if link is not None and link.target == name:
+                continue
+            if link is not None:
                 link.destroy()
-            if link is None or link.target != name:
-                self.links[role] = ParameterLink(self._node, name)
+            link = self.links[role] = ParameterLink(self._node, name)
+            if role == 'robot':
+                self.state.robot_values = link.values
+            else:
+                self.state.controller_values = link.values

@@ -1,26 +1,40 @@
-"""The node behind the page: it finds robots, follows them and steers them."""
+"""The node behind the page, which finds, follows and steers robots; and programs that run it."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 
-from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
-from diffdrive_jacobian.live.goal_progress import GoalEnd
+from diffdrive_jacobian.control import Path
+from diffdrive_jacobian.drives import in_lockstep, in_real_time
+from diffdrive_jacobian.drives.driving import overrides, recorder_of
+from diffdrive_jacobian.live.commands import Command, Pause, RobotCommand, SetSpeed, Step
 from diffdrive_jacobian.live.live_robot import LiveRobot
-from diffdrive_jacobian.live.pacing import Pacing
+from diffdrive_jacobian.live.robot_state import GoalEnd
+from diffdrive_jacobian.live.server import LiveServer, Ready
 from diffdrive_jacobian.live.session import Session, Snapshot
+from diffdrive_jacobian.lockstep.runner import LockstepRunner
 from diffdrive_jacobian.messages.codecs import PARAMETER_EVENT, Changes
 from diffdrive_jacobian.messages.names import base_name, full_name, is_named, namespace_of, node_of
 from diffdrive_jacobian.messages.topics import PARAMETER_EVENTS, TOPICS
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.recording.recording import Recording
+from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 
 NAME = 'live_page'
@@ -33,6 +47,74 @@ MAX_ROBOTS = 16
 """Largest number of robots that are shown."""
 LOST = 30.0
 """Time without odometry and publisher after which a robot is no longer shown (s)."""
+NAP = 0.02
+"""Longest time for which `pace` waits before it looks at commands again (s)."""
+MAX_LAG = 0.1
+"""Time that is made up for at most (s). A machine that is too slow shows time as it comes."""
+
+
+class Pacing:
+    """Decides when simulated time may advance."""
+
+    def __init__(self, *, speed: float = 1.0, paused: bool = False) -> None:
+        """Start at a speed relative to the clock on the wall."""
+        self.speed, self.paused = speed, paused
+        self._steps = 0
+        self._simulated = self._wait = 0.0
+        self._anchor: tuple[float, float] | None = None
+
+    def now(self) -> float:
+        """Return the simulated time at which it was asked last whether time may advance (s)."""
+        return self._simulated
+
+    def obey(self, command: Pause | Step | SetSpeed) -> None:
+        """Do what a page asks for."""
+        self._anchor = None
+        if isinstance(command, Pause):
+            self.paused = command.paused
+        elif isinstance(command, Step):
+            self.paused = True
+            self._steps += 1
+        else:
+            self.speed = command.speed
+
+    def may_advance(self, simulated: float, now: float) -> bool:
+        """Return whether time may advance beyond a simulated time, at a time on the wall (s)."""
+        self._simulated = simulated
+        if self.paused:
+            self._anchor = None
+            if not self._steps:
+                return False
+            self._steps -= 1
+            return True
+        if self._anchor is None:
+            self._anchor = simulated, now
+        lag = (now - self._anchor[1]) * self.speed - (simulated - self._anchor[0])
+        if lag > MAX_LAG * self.speed:
+            self._anchor = simulated, now
+        self._wait = -lag / self.speed
+        return lag >= 0.0
+
+    def pace(self, simulated: float, meanwhile: Callable[[], bool]) -> bool:
+        """Wait until time may advance beyond a simulated time (s), or `meanwhile` returns True.
+
+        Returns:
+            Whether `meanwhile` ended the wait.
+        """
+        while not self.may_advance(simulated, time.monotonic()):
+            if meanwhile():
+                return True
+            time.sleep(NAP if self.paused else min(NAP, max(0.0, self._wait)))
+        return False
+
+    def shown(self) -> dict[str, Any]:
+        """Return what the page shows."""
+        return {
+            'kind': 'lockstep',
+            'time': round(self._simulated, 3),
+            'paused': self.paused,
+            'speed': self.speed,
+        }
 
 
 class LivePage(Node):  # type: ignore[misc]
@@ -52,10 +134,10 @@ class LivePage(Node):  # type: ignore[misc]
         Args:
             session: What the page shows, and where its commands come from.
             context: Context of the node.
-            polled: Whether it is run by a SingleThreadedExecutor: it then polls its topics with a timer
-                of its own. Otherwise `work` must be called often.
+            polled: Whether it polls its topics with a timer of its own, as a SingleThreadedExecutor
+                needs it. Otherwise `work` must be called often.
             pacing: Control of simulated time. None: time is real.
-            goal_ended: Receives the end of each goal. None: nothing does.
+            goal_ended: Receives the end of each goal.
         """
         super().__init__(NAME, context=context, start_parameter_services=False)
         self._session, self._polled, self._pacing = session, polled, pacing
@@ -121,13 +203,12 @@ class LivePage(Node):  # type: ignore[misc]
         return [f'at most {MAX_ROBOTS} robots are shown; {count} more publish odometry: {names}{more}']
 
     def _obey(self, page: int, command: Command) -> None:
-        if isinstance(command, (Pause, Step, SetSpeed, Seek)):
-            if self._pacing is None or isinstance(command, Seek):
-                self._session.notify(
-                    'time is real here: it can neither pause nor change its speed', 'warning'
-                )
-            else:
+        if not isinstance(command, RobotCommand):
+            if self._pacing is not None and isinstance(command, (Pause, Step, SetSpeed)):
                 self._pacing.obey(command)
+            else:
+                text = 'time is real here: it can neither pause nor change its speed'
+                self._session.notify(text, 'warning')
             return
         robot = self.robots.get(command.robot)
         if robot is None:
@@ -168,18 +249,13 @@ class LivePage(Node):  # type: ignore[misc]
         if len(self.robots) >= MAX_ROBOTS:
             self._unshown.append(namespace)
             return
+        names, clock = self._names, self._robot_time
         try:
-            self.robots[namespace] = LiveRobot(
-                self,
-                self._session,
-                namespace,
-                self._names,
-                polled=self._polled,
-                clock=self._robot_time,
-            )
-            self.robots[namespace].on_end = self._goal_ended
+            robot = LiveRobot(self, self._session, namespace, names, polled=self._polled, clock=clock)
         except ParameterError as error:
             self._refuse(namespace, error)
+        else:
+            self.robots[namespace], robot.on_end = robot, self._goal_ended
 
     def _refuse(self, name: str, error: ParameterError) -> None:
         if name not in self._refused:
@@ -195,3 +271,115 @@ class LivePage(Node):  # type: ignore[misc]
             for link in robot.links.values():
                 if link.target == changes.node:
                     link.changed(changes.values)
+
+
+def watch_nodes(*, ros_arguments: Sequence[str], port: int, signals: Signals, ready: Ready) -> None:
+    """Show and steer robots whose nodes run in other processes.
+
+    Args:
+        ros_arguments: ROS arguments of the node.
+        port: TCP port of the page. 0: any free one.
+        signals: Counter of the signals that end it.
+        ready: Receives the server when it answers.
+
+    Raises:
+        UserError: The ROS arguments are invalid.
+        OSError: The port is in use.
+    """
+    session = Session()
+    with closing(LiveServer(session, port)) as server:
+        ready(server)
+        with (
+            ros_context(['watch_run', *ros_arguments]) as context,
+            running(context, isolated=False) as runner,
+        ):
+            page = runner.add(lambda: LivePage(session, context, polled=True))
+            try:
+                runner.spin(lambda: False, signals=signals)
+            finally:
+                page.stop()
+
+
+def drive_live(
+    goals: NDArray[np.float64] | Path,
+    *,
+    relative: bool = False,
+    lockstep: bool,
+    isolated: bool,
+    parameters: Mapping[str, Any],
+    robot_parameters: Mapping[str, Any],
+    recording: Recording | None,
+    ros_arguments: Sequence[str],
+    port: int,
+    signals: Signals,
+    ready: Ready,
+    nodes_created: Callable[[Sequence[str]], None],
+    goal_ended: Callable[[GoalEnd], None] | None = None,
+) -> None:
+    """Run robot, wheel bridge and controller in this process, with the page, until a signal comes.
+
+    Args:
+        goals: `[x, y, theta]` of goals that are sent when a page is open, shape (n, 3), n may be 0
+            (m, m, rad). Or a path.
+        relative: Whether they are in the body frame of the robot where it is then.
+        lockstep: Whether time is simulated. The page then has pause, step and speed.
+        isolated: Whether no other process can communicate with the nodes.
+        parameters: Parameters of go_to_goal.
+        robot_parameters: Parameters of virtual_robot.
+        recording: Recording of what the nodes publish. The caller must finish it.
+        ros_arguments: ROS arguments of all nodes.
+        port: As for `watch_nodes`.
+        signals: Likewise.
+        ready: Likewise.
+        nodes_created: Receives the fully qualified names of the nodes.
+        goal_ended: Receives the end of each goal.
+
+    Raises:
+        UserError: A node cannot run with the parameters or ROS arguments given.
+        DriveError: In lockstep, a callback blocks, or simulated time cannot advance.
+        OSError: The port is in use.
+    """
+    session = Session()
+    stage = in_lockstep(ros_arguments) if lockstep else in_real_time(ros_arguments, isolated=isolated)
+    with closing(LiveServer(session, port)) as server, ExitStack() as stack:
+        ready(server)
+        runner = stack.enter_context(stage)
+        context = runner.context
+        of_robot = overrides({**robot_parameters, 'command_interface': 'wheels'})
+        of_controller = overrides(parameters)
+        nodes: list[Node] = [
+            runner.add(lambda: VirtualRobot(context=context, parameter_overrides=of_robot)),
+            runner.add(lambda: WheelBridge(context=context)),
+            runner.add(lambda: GoToGoal(context=context, parameter_overrides=of_controller)),
+        ]
+        nodes_created([node.get_fully_qualified_name() for node in nodes])
+        pacing = Pacing() if lockstep else None
+        # The executor of nodes that others can reach leaves the topics to `work`.
+        page = runner.add(
+            lambda: LivePage(session, context, polled=not isolated, pacing=pacing, goal_ended=goal_ended)
+        )
+        stack.callback(page.stop)
+        discover = recorder_of(runner, recording)
+        waiting = [goals] if isinstance(goals, Path) or len(goals) else []
+
+        def work() -> bool:
+            discover()
+            page.work()
+            robot = next(iter(page.robots.values()), None)
+            # Whoever opened the page wants to see the whole drive.
+            if waiting and session.watched and robot is not None and robot.ready:
+                robot.send(waiting.pop(), relative=relative)
+            return signals.count > 0
+
+        if pacing is None:
+            runner.spin(work)
+            return
+        assert isinstance(runner, LockstepRunner)
+
+        def meanwhile() -> bool:
+            over = work()
+            # What the page has sent is answered also while time stands.
+            runner.settle()
+            return over
+
+        runner.spin(lambda: work() or pacing.pace(runner.seconds(), meanwhile))

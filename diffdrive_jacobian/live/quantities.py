@@ -9,11 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.control import Arrival
-from diffdrive_jacobian.kinematics.diff_drive import (
-    body_to_wheel_jacobian,
-    unicycle_jacobian,
-    wheel_to_body_jacobian,
-)
+from diffdrive_jacobian.kinematics import diff_drive
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 
 Array = NDArray[np.float64]
@@ -36,10 +32,7 @@ def rounded(value: Any) -> Any:
 
 
 def region(covariance: Array) -> dict[str, Any] | None:
-    """Return the ellipse that contains the position with 95 %, and the deviation of the heading.
-
-    Args:
-        covariance: Covariance of `[x, y, theta]`, shape (3, 3).
+    """Return the ellipse that contains the position with 95 %, of a covariance, shape (3, 3).
 
     Returns:
         Half axes `a >= b` (m), the direction of a (rad), and 1.96 standard deviations of the heading
@@ -59,10 +52,7 @@ def region(covariance: Array) -> dict[str, Any] | None:
 def errors(pose: Array, goal: Array, offset: float) -> Pair:
     """Return the distance of the driven point to a goal (m), and the bearing error (rad).
 
-    Args:
-        pose: `[x, y, theta]`, shape (3,).
-        goal: Likewise.
-        offset: X coordinate of the driven point in the body frame (m).
+    Pose and goal are `[x, y, theta]`, offset is the x coordinate of the point in the body frame (m).
     """
     x, y, theta = pose.tolist()
     distance = float(Arrival(offset=offset).distance(x, y, theta, float(goal[0]), float(goal[1])))
@@ -90,12 +80,12 @@ def chain(
         Matrices and vectors. `measured` says whether the second half follows from measured wheel speeds.
     """
     scale = np.array(radius_multipliers)
-    inverse, forward = body_to_wheel_jacobian(*geometry), wheel_to_body_jacobian(*geometry)
-    inverse, forward = inverse / scale[:, np.newaxis], forward * scale
+    inverse = diff_drive.body_to_wheel_jacobian(*geometry) / scale[:, np.newaxis]
+    forward = diff_drive.wheel_to_body_jacobian(*geometry) * scale
     wanted = inverse @ np.array(command)
     wheels = wanted if measured is None else np.array(measured)
     twist = forward @ wheels
-    jacobian = unicycle_jacobian(theta)
+    jacobian = diff_drive.unicycle_jacobian(theta)
     return {
         'command': rounded(command),
         'inverse': rounded(inverse),

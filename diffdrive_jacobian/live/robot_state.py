@@ -1,4 +1,4 @@
-"""What is known of one robot, its path included, and the JSON object that the page receives of it."""
+"""What is known of one robot, its path and goals included, and what the page receives of it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,22 +15,43 @@ from diffdrive_jacobian.bags.run import number
 from diffdrive_jacobian.bags.timeline import heading_counts
 from diffdrive_jacobian.control import Arrival, LawError, Path
 from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.control.path import PathProgress
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.live import quantities
-from diffdrive_jacobian.live.goal_progress import GoalEnd, GoalProgress, Goals, poses_of
 from diffdrive_jacobian.live.quantities import rounded
-from diffdrive_jacobian.messages.goal_follower import FollowedGoal
+from diffdrive_jacobian.messages.goal_follower import (
+    UNSTAMPED,
+    Fate,
+    FollowedGoal,
+    GoalFollower,
+    Stamp,
+)
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 
+ROBOT_DEFAULTS = VirtualRobotParameters()
+CONTROLLER_DEFAULTS = GoToGoalParameters()
+Values = Mapping[str, Any]
+Goals = NDArray[np.float64]
+"""`[x, y, theta]` of each, shape (n, 3) (m, m, rad)."""
+MAX_PLANNED = 300
+"""Number of points of a planned path that the page draws."""
 MAX_POINTS = 6000
-"""Largest number of points of a path."""
+"""Largest number of points of a path that was driven."""
 SPACING = 0.01
 """Distance between two points of a path (m). It doubles when the path is full, unless jumps fill it."""
 JUMP = 0.3
 """A longer step is not a motion: the path is interrupted (m)."""
+PLACED_JUMP = 0.03
+"""Step from which the path of a robot is interrupted that is being placed (m)."""
+PLACED_LIFE = 15
+"""Number of odometry messages within which that counts."""
+TRUTH_LIFE = 1.0
+"""Difference of the stamps of odometry and ground truth up to which both are shown (s)."""
+MIN_LENGTH = 1e-4
+"""Smallest wheel radius and separation that count (m). Parameters of any node may be anything."""
 
 
 class Trail:
@@ -43,12 +64,9 @@ class Trail:
         self._spacing = spacing
 
     def extended(self, x: float, y: float, jump: float = JUMP) -> Trail:
-        """Add a position, and return the path: this one, or a new one if this one was full.
+        """Add a position (m), and return the path: this one, or a new one if this one was full.
 
-        Args:
-            x: Position (m).
-            y: Likewise.
-            jump: Step from which the path is interrupted (m).
+        A step of more than `jump` (m) interrupts it.
         """
         last = self.points[-1] if self.points else None
         step = math.inf if last is None else math.hypot(x - last[0], y - last[1])
@@ -66,23 +84,148 @@ class Trail:
             trail.points = self.points[MAX_POINTS // 2 :]
             return trail
         trail = Trail(2.0 * self._spacing)
-        trail.points = [
-            point for index, point in enumerate(self.points) if point is None or index % 2 == 0
-        ]
+        trail.points = [one for index, one in enumerate(self.points) if one is None or index % 2 == 0]
         return trail
 
 
-ROBOT_DEFAULTS = VirtualRobotParameters()
-CONTROLLER_DEFAULTS = GoToGoalParameters()
-Values = Mapping[str, Any]
-PLACED_JUMP = 0.03
-"""Step from which the path of a robot is interrupted that is being placed (m)."""
-PLACED_LIFE = 15
-"""Number of odometry messages within which that counts."""
-TRUTH_LIFE = 1.0
-"""Difference of the stamps of odometry and ground truth up to which both are shown (s)."""
-MIN_LENGTH = 1e-4
-"""Smallest wheel radius and separation that count (m). Parameters of any node may be anything."""
+def poses_of(goals: Goals | Path) -> Goals:
+    """Return goals, of a path its poses."""
+    return goals.poses if isinstance(goals, Path) else goals
+
+
+class GoalEnd(NamedTuple):
+    """The end of a goal. Poses are `[x, y, theta]`, shape (3,) (m, m, rad)."""
+
+    robot: str
+    """Namespace of the robot, `/` or `/NAME`."""
+    state: GoalState
+    """SUCCEEDED, CANCELED or ABORTED."""
+    goal: NDArray[np.float64]
+    """The goal that was driven to last."""
+    pose: NDArray[np.float64] | None
+    """Pose of the robot. None: there is no odometry."""
+    distance: float
+    """Distance from the driven point to the goal by the odometry (m). NaN without odometry."""
+    true_distance: float
+    """The same by the ground truth (m). NaN: it is not known."""
+
+
+class GoalProgress:
+    """The goals of a robot, and how far it is."""
+
+    def __init__(self) -> None:
+        """Start without goals."""
+        self.index = 0
+        """Index of the goal that is driven to."""
+        self._points: Any = None
+        self.path: PathProgress | None = None
+        """The path that is driven along, and the progress. None: goals are driven to."""
+        self._follower: GoalFollower[Goals | Path] = GoalFollower()
+        self._shown: FollowedGoal[Goals | Path] | None = None
+
+    @property
+    def goals(self) -> Goals | None:
+        """The goals that were sent last, or that the controller has reported since. None: unknown."""
+        goal = None if self._shown is None else self._shown.goal
+        return None if goal is None else poses_of(goal)
+
+    @property
+    def state(self) -> GoalState:
+        """Their state. While they wait for an answer, that of the goals before, if they are active."""
+        shown, driving = self._shown, self._follower.driving
+        if shown is None:
+            return GoalState.UNKNOWN
+        return driving.state if driving is not None and shown.fate is Fate.WAITING else shown.state
+
+    @property
+    def active(self) -> bool:
+        """Whether a controller drives the robot to a goal."""
+        return self.state.active
+
+    @property
+    def current(self) -> NDArray[np.float64] | None:
+        """The goal that is driven to, shape (3,). None: none or unknown."""
+        return None if self.goals is None or not self.active else self.goals[self.index]
+
+    @property
+    def reached(self) -> NDArray[np.float64] | None:
+        """The goal at which the robot arrived, shape (3,). None: none or unknown."""
+        return None if self.goals is None or self.state is not GoalState.SUCCEEDED else self.goals[-1]
+
+    @property
+    def last(self) -> bool:
+        """Whether the goal that is driven to is the last one."""
+        return self.goals is not None and self.index == len(self.goals) - 1
+
+    def remaining(self, *, fresh: bool = False) -> Goals:
+        """Return the goals that are not reached yet; of fresh ones no status needs to be known."""
+        waiting = fresh and self._shown is not None and self._shown.fate is Fate.WAITING
+        if self.goals is None or not (self.active or waiting):
+            return np.empty((0, 3))
+        return self.goals[self.index :]
+
+    def sent(self, goals: Goals | Path, stamp: Stamp) -> None:
+        """Take goals or a path that somebody has sent, with their stamp."""
+        shown = self._shown
+        if shown is not None and shown.goal is not None and shown.stamp == stamp != UNSTAMPED:
+            # Those that this program has sent come back by their topic.
+            return
+        if len(poses_of(goals)):
+            self._show(self._follower.sent(goals, stamp))
+
+    def reported(self, status: int, stamp: Stamp) -> FollowedGoal[Goals | Path] | None:
+        """Take a status of a controller. Return the goals of which something else became, or None."""
+        changed = self._follower.reported(status, stamp)
+        driving = self._follower.driving
+        if driving is not None and (driving.stamp == stamp or changed is self._shown):
+            # The goals after them were refused, or they were sent before this program listened.
+            self._show(driving)
+        elif self._shown is None:
+            self._shown = changed
+        return changed
+
+    def replay(self, goals: Goals | Path | None, index: int, state: GoalState) -> None:
+        """Show recorded goals or a recorded path, and their state."""
+        self._shown, self.index = FollowedGoal(goals, UNSTAMPED, state), index
+        self._use(goals)
+
+    def moved(self, pose: NDArray[np.float64], arrival: Arrival) -> None:
+        """Take a pose of the robot, `[x, y, theta]`: a waypoint may be reached."""
+        if self.goals is None or not self.active:
+            return
+        if self.path is not None:
+            self.path.moved(pose)
+            passed = self.path.path.arc_lengths.searchsorted(self.path.s, 'right')
+            self.index = min(int(passed), len(self.goals) - 1)
+            return
+        x, y, theta = pose.tolist()
+        while self.index + 1 < len(self.goals):
+            if not arrival.reached(x, y, theta, *self.goals[self.index, :2].tolist()):
+                return
+            self.index += 1
+
+    def shown(self) -> dict[str, Any]:
+        """Return what the page shows."""
+        common = {'state': self.state.name.lower(), 'active': self.active}
+        if self.path is not None:
+            # All poses would be too many, many times a second.
+            end = rounded(self.path.path.poses[-1:])
+            return {**common, 'goals': end, 'index': 0, 'path': self._points}
+        return {**common, 'goals': rounded(self.goals), 'index': self.index}
+
+    def _show(self, followed: FollowedGoal[Goals | Path]) -> None:
+        if followed is not self._shown:
+            self._shown, self.index, self.path = followed, 0, None
+            self._use(followed.goal)
+
+    def _use(self, goals: Goals | Path | None) -> None:
+        """Take what is driven to, the progress along a path as it was if it is the same."""
+        if not isinstance(goals, Path):
+            self.path = None
+        elif self.path is None or self.path.path is not goals:
+            self.path = PathProgress(goals)
+            s = np.linspace(0.0, goals.length, MAX_PLANNED)
+            self._points = rounded(goals.poses_at(s)[:, :2])
 
 
 def _number(values: Values, name: str, default: float) -> float:
@@ -129,9 +272,7 @@ class RobotState:
 
     @property
     def geometry(self) -> tuple[float, float]:
-        """Wheel radius and separation (m), of the virtual robot by default. The separation is that which
-        the odometry assumes; the radius of each wheel has a multiplier in addition.
-        """
+        """Wheel radius, and the separation that the odometry assumes (m)."""
         values = self.robot_values
         r = _number(values, 'wheel_radius', ROBOT_DEFAULTS.wheel_radius)
         L = _number(values, 'wheel_separation', ROBOT_DEFAULTS.wheel_separation)
@@ -152,15 +293,10 @@ class RobotState:
     @property
     def wheel_names(self) -> tuple[str, str]:
         """Names of the left and the right joint."""
-        left, right = (
-            self.robot_values.get(f'{side}_wheel_name', default)
-            for side, default in zip(('left', 'right'), ROBOT_DEFAULTS.wheel_names, strict=True)
-        )
-        return (
-            (left, right)
-            if isinstance(left, str) and isinstance(right, str)
-            else ROBOT_DEFAULTS.wheel_names
-        )
+        usual = ROBOT_DEFAULTS.wheel_names
+        left = self.robot_values.get('left_wheel_name', usual[0])
+        right = self.robot_values.get('right_wheel_name', usual[1])
+        return (left, right) if isinstance(left, str) and isinstance(right, str) else usual
 
     @property
     def arrival(self) -> Arrival:
@@ -220,13 +356,12 @@ class RobotState:
         """Expect a jump of the path: the robot is placed elsewhere."""
         self._placed = PLACED_LIFE
 
-    def shown(self, *, age: float, by_hand: bool, **more: Any) -> dict[str, Any] | None:
+    def shown(self, *, age: float, by_hand: bool) -> dict[str, Any] | None:
         """Return the JSON object for the page. None: there was no odometry.
 
         Args:
             age: Time since the last odometry was received (s).
             by_hand: Whether a page drives it.
-            more: Further entries.
         """
         if self.pose is None:
             return None
@@ -277,7 +412,6 @@ class RobotState:
             'chain': quantities.chain(
                 float(self.pose[2]), command, self.wheels, geometry, self.radius_multipliers
             ),
-            **more,
         }
 
     def _law(self, target: NDArray[np.float64] | None) -> dict[str, Any]:

@@ -37,13 +37,7 @@ class Latest:
     """The latest message of a topic, as bytes until somebody looks at it."""
 
     def __init__(self, node: Node, codec: Codec[Any], topic: str, *, polled: bool) -> None:
-        """Subscribe.
-
-        Args:
-            node: The node that subscribes.
-            codec: What is read of the messages.
-            topic: Name of the topic.
-            polled: Whether `take` must fetch messages. Otherwise the executor delivers them.
+        """Subscribe. If polled, `take` must fetch messages, otherwise the executor delivers them.
 
         Raises:
             ParameterError: The topic has another type in this process.
@@ -81,16 +75,10 @@ class Latest:
 
 
 class RobotTopics:
-    """Subscriptions and publishers of one robot. Publishers are created when they are first used."""
+    """Subscriptions and publishers of one robot."""
 
     def __init__(self, node: Node, namespace: str, names: dict[str, str], *, polled: bool) -> None:
-        """Subscribe.
-
-        Args:
-            node: The node that subscribes.
-            namespace: Namespace of the robot, `/` or `/NAME`.
-            names: Names of topics without namespace, from the usual ones.
-            polled: As for `Latest`.
+        """Subscribe in a namespace; `names` are those of topics without namespace, by the usual ones.
 
         Raises:
             ParameterError: A topic has another type in this process.
@@ -107,6 +95,9 @@ class RobotTopics:
         """cmd_vel. None: nobody publishes or reads it yet."""
         self._subscriptions: list[Subscription] = []
         self._use_twist(TWIST)
+        # Before they are used, so that the readers of goals are discovered by then.
+        for topic, kind in MESSAGES.items():
+            self._publisher(kind, topic)
 
     def full(self, name: str) -> str:
         """Return the fully qualified name of a topic or service of the robot."""
@@ -117,15 +108,10 @@ class RobotTopics:
     ) -> None:
         """Receive every message of a topic, except for what `ignoring_invalid` ignores."""
         kind = message_class(codec.type_name)
+        received, qos = ignoring_invalid(codec, kind, callback), LATCHED if latched else 10
         with explaining_failure(self._node, kind, self.full(topic)):
             self._subscriptions.append(
-                self._node.create_subscription(
-                    kind,
-                    self.full(topic),
-                    ignoring_invalid(codec, kind, callback),
-                    LATCHED if latched else 10,
-                    raw=True,
-                )
+                self._node.create_subscription(kind, self.full(topic), received, qos, raw=True)
             )
 
     def use_twist_type(self, types: list[str]) -> None:
@@ -169,11 +155,6 @@ class RobotTopics:
         own = {(self._node.get_namespace(), self._node.get_name())}
         found = self._node.get_subscriptions_info_by_topic(self.full(topic))
         return sum((one.node_namespace, one.node_name) not in own for one in found)
-
-    def prepare(self) -> None:
-        """Create the publishers of goals, so that their readers are discovered before they are used."""
-        for topic, kind in MESSAGES.items():
-            self._publisher(kind, topic)
 
     def _publisher(self, kind: type, topic: str) -> Publisher:
         if topic not in self._publishers:

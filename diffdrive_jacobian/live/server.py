@@ -12,21 +12,40 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from functools import partial
 from http import HTTPStatus
-from typing import Any
+from importlib.resources import files
+from typing import Any, TypeAlias
 
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from diffdrive_jacobian.live.commands import MAX_SIZE, CommandError, parse
-from diffdrive_jacobian.live.files import page_files
 from diffdrive_jacobian.live.session import Page, Session
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
+
+TYPES = {
+    '.html': 'text/html; charset=utf-8',
+    '.css': 'text/css; charset=utf-8',
+    '.js': 'text/javascript; charset=utf-8',
+    '.svg': 'image/svg+xml',
+}
+"""Content type by the ending of a file."""
+
+
+def page_files() -> dict[str, tuple[str, bytes]]:
+    """Return content type and content of every file of the page, by name."""
+    found = {}
+    for file in files('diffdrive_jacobian.live').joinpath('page').iterdir():
+        ending = file.name[file.name.rfind('.') :]
+        if ending in TYPES:
+            found[file.name] = TYPES[ending], file.read_bytes()
+    return found
+
 
 HOSTS = ('127.0.0.1', 'localhost')
 """Names of this machine by which the page may be reached. The port may differ, as through ssh -L."""
@@ -64,26 +83,13 @@ class Access:
         """Choose the secrets."""
         self.token = secrets.token_urlsafe(24)
         """First part of every path."""
-        self._ticket = secrets.token_urlsafe(24)
-
-    @property
-    def opening_path(self) -> str:
-        """Path that redirects to the page, once.
-
-        A browser is started with it. Its command line can be read by other users of the machine, but is
-        worthless after the first use.
-        """
-        return f'/{OPEN}/{self._ticket}'
+        self.ticket = secrets.token_urlsafe(24)
+        """Second part of the path that redirects to the page, once."""
 
     def check(
         self, path: str, hosts: Sequence[str], origins: Sequence[str]
     ) -> tuple[str, str] | Refusal:
-        """Return what is requested.
-
-        Args:
-            path: Path of the request, with its query.
-            hosts: Values of the header Host.
-            origins: Values of the header Origin.
+        """Check path, Host and Origin headers of a request.
 
         Returns:
             `('page', NAME)` for a file, `('socket', '')`, `('redirect', PATH)`, or why it is refused.
@@ -103,9 +109,9 @@ class Access:
         return ('socket', '') if origins else Refusal.ORIGIN
 
     def _use_ticket(self, ticket: str) -> bool:
-        valid = bool(self._ticket) and _same(ticket, self._ticket)
+        valid = bool(self.ticket) and _same(ticket, self.ticket)
         if valid:
-            self._ticket = ''
+            self.ticket = ''
         return valid
 
 
@@ -159,14 +165,10 @@ class _Connection(ServerConnection):
 
 
 class LiveServer:
-    """Serves the page of a session."""
+    """Serves the page of a session, in a thread of its own, until it is closed."""
 
     def __init__(self, session: Session, port: int = 0) -> None:
-        """Listen. `start` begins to answer.
-
-        Args:
-            session: What the page shows, and where its commands go.
-            port: TCP port. 0: any free one.
+        """Listen on a TCP port (0: any free one).
 
         Raises:
             OSError: The port is in use, or may not be used.
@@ -182,6 +184,7 @@ class LiveServer:
         self._loop = asyncio.new_event_loop()
         self._closing = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name='live page', daemon=True)
+        self._thread.start()
 
     @property
     def url(self) -> str:
@@ -190,24 +193,18 @@ class LiveServer:
 
     @property
     def opening_url(self) -> str:
-        """Address that leads to the page once, for the command line of a browser."""
-        return f'http://{ADDRESS}:{self.port}{self.access.opening_path}'
+        """Address that leads to the page once.
 
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
+        It is for the command line of a browser, which other users of the machine can read.
+        """
+        return f'http://{ADDRESS}:{self.port}/{OPEN}/{self.access.ticket}'
 
     def close(self) -> None:
         """Disconnect all pages and end the thread."""
-        self._session.closed = True
-        if self._thread.is_alive():
+        # The loop is closed if the thread has ended.
+        with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._closing.set)
-            self._thread.join(PATIENCE)
-        else:
-            self._socket.close()
-            self._loop.close()
-
-    # --- In the thread
+        self._thread.join(PATIENCE)
 
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
@@ -221,13 +218,13 @@ class LiveServer:
         # Who cannot connect is told so. Nothing of that is for the terminal.
         logger.addHandler(logging.NullHandler())
         logger.propagate = False
-        # Any factory does, as it says.
-        bounded: Any = partial(_Connection, strangers=self._strangers)
+        # Typed as a class, but any factory does.
+        factory: Any = partial(_Connection, strangers=self._strangers)
         server = await serve(
             self._handle,
             sock=self._socket,
             backlog=MAX_STRANGERS,
-            create_connection=bounded,
+            create_connection=factory,
             process_request=self._answer,
             compression=None,
             max_size=MAX_SIZE,
@@ -240,9 +237,6 @@ class LiveServer:
             logger=logger,
         )
         await self._closing.wait()
-        await self._close(server)
-
-    async def _close(self, server: Server) -> None:
         server.close()
         for transport in self._strangers.values():
             transport.abort()
@@ -310,6 +304,10 @@ class LiveServer:
                 continue
             if not self._session.put(page, command):
                 self._session.notify('too many commands are waiting: this one was dropped', 'warning')
+
+
+Ready: TypeAlias = Callable[[LiveServer], None]
+"""Receives a server when it answers."""
 
 
 def _response(status: HTTPStatus, kind: str, body: bytes, **more: str) -> Response:

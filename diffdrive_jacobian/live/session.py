@@ -6,7 +6,6 @@ not a page reads it. A slow page receives fewer states, never older ones.
 
 from __future__ import annotations
 
-import itertools
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -44,7 +43,7 @@ class Page:
     """One open page: what it has received so far."""
 
     def __init__(self, number: int, notice: int) -> None:
-        """Start with a number of its own, after the last notice."""
+        """Start after a notice."""
         self.number = number
         self._version = -1
         self._notice = notice
@@ -69,17 +68,16 @@ class Page:
         return frame
 
     def _paths(self, kind: str, trails: Mapping[str, Trail]) -> dict[str, Any]:
-        paths = {name: self._path((kind, name), trail) for name, trail in trails.items()}
-        return {name: path for name, path in paths.items() if path is not None}
-
-    def _path(self, name: tuple[str, str], trail: Trail) -> dict[str, Any] | None:
-        known, count = self._trails.get(name, (None, 0))
-        start = count if known is trail else 0
-        points = trail.points[start:]
-        self._trails[name] = trail, start + len(points)
-        if known is trail and not points:
-            return None
-        return {'new': known is not trail, 'points': points}
+        found = {}
+        for name, trail in trails.items():
+            known, count = self._trails.get((kind, name), (None, 0))
+            start = count if known is trail else 0
+            # Points may be appended meanwhile.
+            points = trail.points[start:]
+            self._trails[kind, name] = trail, start + len(points)
+            if points or known is not trail:
+                found[name] = {'new': known is not trail, 'points': points}
+        return found
 
 
 class Session:
@@ -91,11 +89,8 @@ class Session:
         self._version, self._snapshot = 0, Snapshot()
         self._commands: deque[tuple[int, Command]] = deque()
         self._notices: deque[dict[str, Any]] = deque(maxlen=MAX_NOTICES)
-        self._notice_numbers, self._page_numbers = itertools.count(1), itertools.count(1)
-        self._last_notice = 0
+        self._last_notice = self._last_page = 0
         self._pages: frozenset[int] = frozenset()
-        self.closed = False
-        """Whether the server has ended."""
 
     # --- From the nodes
 
@@ -126,7 +121,7 @@ class Session:
     def notify(self, text: str, level: Level = 'info') -> None:
         """Show a notice on all pages."""
         with self._lock:
-            self._last_notice = next(self._notice_numbers)
+            self._last_notice += 1
             self._notices.append({'number': self._last_notice, 'level': level, 'text': text})
 
     # --- From the server
@@ -146,7 +141,8 @@ class Session:
     def enter(self) -> Page:
         """Return a new page."""
         with self._lock:
-            page = Page(next(self._page_numbers), self._last_notice)
+            self._last_page += 1
+            page = Page(self._last_page, self._last_notice)
             self._pages |= {page.number}
         return page
 

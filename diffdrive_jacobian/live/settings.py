@@ -23,6 +23,13 @@ Range = tuple[float, float]
 """Smallest and largest value."""
 MAX_CHOICES = 32
 """Largest number of controllers that are offered."""
+TYPES: dict[str, type[float | str | bool]] = {
+    'number': float,
+    'limit': float,
+    'choice': str,
+    'flag': bool,
+}
+"""Type of the values of each kind of setting."""
 TAKES_TIME = 'Time to follow commands'
 
 
@@ -52,11 +59,8 @@ class Setting:
     """Heading below which it is folded away while none of the group is in use; '': always shown."""
 
     def slider(self, served: Range | None) -> Range:
-        """Return the range of the slider for a node that serves a range in its descriptor.
-
-        A node of this package serves all valid values, of which the usual ones are shown. Another node
-        knows better.
-        """
+        """Return the range of the slider for a node that serves a range in its descriptor."""
+        # A node of this package serves all valid values, of which the usual ones are shown.
         return (self.low, self.high) if served is None or served == self.declared else served
 
     @property
@@ -70,14 +74,9 @@ class Setting:
         Raises:
             SettingError: It is of another type.
         """
-        if self.kind == 'choice' and isinstance(value, str):
+        value = math.nan if self.kind == 'limit' and value is None else value
+        if isinstance(value, TYPES[self.kind]):
             return value
-        if self.kind == 'flag' and isinstance(value, bool):
-            return value
-        if self.kind in ('number', 'limit') and isinstance(value, float):
-            return value
-        if self.kind == 'limit' and value is None:
-            return math.nan
         raise SettingError(f'{self.name} cannot be {printable(repr(value), 40)}')
 
 
@@ -177,16 +176,12 @@ def shown(
 ) -> list[dict[str, Any]]:
     """Return the settings that nodes have, with their values, for the page.
 
-    Args:
-        values: Parameters by role.
-        gains: Gains of the controller.
-        ranges: Ranges that the nodes serve in the descriptors of their parameters, by role.
+    `values` and `ranges` are the parameters by role, and the ranges that the nodes serve.
     """
     found = []
     for setting in offered(gains):
         value = values.get(setting.role, {}).get(setting.name)
-        expected = {'choice': str, 'flag': bool}.get(setting.kind, float)
-        if not isinstance(value, expected):
+        if not isinstance(value, TYPES[setting.kind]):
             continue
         low, high = setting.slider(ranges.get(setting.role, {}).get(setting.name))
         row = {
@@ -198,14 +193,10 @@ def shown(
             'kind': setting.kind,
             'low': low,
             'high': high,
-            'value': rounded(value)
-            if isinstance(value, float)
-            else value[:64]
-            if isinstance(value, str)
-            else value,
+            'value': value[:64] if isinstance(value, str) else rounded(value),
         }
         if setting.kind == 'choice':
-            row['choices'] = _choices(str(row['value']))
+            row['choices'] = list(dict.fromkeys([*_controllers()[:MAX_CHOICES], row['value']]))
         found.append(row)
     return found
 
@@ -214,7 +205,3 @@ def shown(
 def _controllers() -> tuple[str, ...]:
     # To find the installed ones takes many milliseconds.
     return tuple(controller_names())
-
-
-def _choices(value: str) -> list[str]:
-    return list(dict.fromkeys([*_controllers()[:MAX_CHOICES], value]))

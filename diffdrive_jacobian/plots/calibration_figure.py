@@ -1,7 +1,4 @@
-"""A calibration as one picture: paths before and after, and the errors over time.
-
-matplotlib is imported when it is drawn. No display is needed.
-"""
+"""A calibration as one picture: paths before and after, and the errors over time."""
 
 from __future__ import annotations
 
@@ -31,11 +28,7 @@ _NO_BREAKS = np.array([], dtype=np.intp)
 
 
 def draw(result: Calibration, ending: str) -> bytes:
-    """Draw a calibration and return the content of a file.
-
-    Args:
-        result: The calibration.
-        ending: Format, `png`, `svg` or `pdf`.
+    """Draw a calibration and return the content of a `png`, `svg` or `pdf` file.
 
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
@@ -73,15 +66,11 @@ def figure(result: Calibration) -> Figure:
             panel.legend(loc='upper left', ncol=2, fontsize=8.5, bbox_to_anchor=(0.0, 1.25))
         _draw_residuals(panels[2], result)
         panels[2].set(xlabel='time [s]')
-        drawing.suptitle(_title(result), fontsize=9.5)
+        names = ('left radius', 'right radius', 'separation')
+        found = zip(names, result.multipliers, np.sqrt(np.diag(result.covariance)), strict=True)
+        multipliers = ', '.join(f'{name} {one:.5f} ± {std:.5f}' for name, one, std in found)
+        drawing.suptitle(f'multipliers: {multipliers}', fontsize=9.5)
     return drawing
-
-
-def _title(result: Calibration) -> str:
-    deviations = np.sqrt(np.diag(result.covariance)).tolist()
-    names = ('left radius', 'right radius', 'separation')
-    values = zip(names, result.multipliers.tolist(), deviations, strict=True)
-    return 'multipliers: ' + ', '.join(f'{name} {one:.5f} ± {std:.5f}' for name, one, std in values)
 
 
 def _draw_plane(plane: Axes, before: list[Track], after: list[Track]) -> None:

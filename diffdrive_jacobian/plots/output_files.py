@@ -20,13 +20,8 @@ NOT_OVERWRITTEN = 'it is not overwritten (--force overwrites files)'
 def create(path: Path, data: bytes, *, replace: bool = False) -> None:
     """Write a new file, which appears only when it is complete.
 
-    Args:
-        path: The file.
-        data: Its content.
-        replace: Whether to replace it if it exists.
-
     Raises:
-        FileExistsError: It exists, and is not changed.
+        FileExistsError: It exists, and is not to be replaced.
         OSError: It cannot be written.
     """
     if os.path.lexists(path) and not replace:
@@ -85,11 +80,7 @@ def extension(path: Path) -> str:
 def new_file(name: str, formats: Sequence[str], what: str, *, replace: bool = False) -> Path:
     """Check, before a long calculation, that a new file can be written, and return its path.
 
-    Args:
-        name: Name of the file.
-        formats: Allowed file name extensions.
-        what: What the file contains, for the error message.
-        replace: Whether it may replace another file.
+    `formats` are the allowed file name extensions, `what` is the content for the error message.
 
     Raises:
         ValueError: The file name has another extension.
@@ -100,8 +91,12 @@ def new_file(name: str, formats: Sequence[str], what: str, *, replace: bool = Fa
     if extension(path) not in formats:
         raise ValueError(f'the {what} must end in .{", .".join(formats)}, got {name!r}')
     try:
-        exists = _is_entry(path)
-        if not exists:
+        try:
+            # Also of a link to nothing. `lexists` hides other errors: a name that is too long.
+            path.lstat()
+            exists = True
+        except FileNotFoundError:
+            exists = False
             check_directory(path.parent)
     except OSError as error:
         error.filename = str(path)
@@ -117,16 +112,3 @@ def check_directory(path: Path) -> None:
         raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
     if not os.access(path, os.W_OK | os.X_OK):
         raise OSError(errno.EACCES, os.strerror(errno.EACCES))
-
-
-def _is_entry(path: Path) -> bool:
-    """Return whether there is a file or a link, also one that points to nothing.
-
-    Raises:
-        OSError: That cannot be determined: a name is too long, or a parent is no directory.
-    """
-    try:
-        path.lstat()
-    except FileNotFoundError:
-        return False
-    return True

@@ -1,21 +1,17 @@
-"""The style of all figures, and the content of a file with one.
-
-matplotlib is imported when something is drawn. No display is needed.
-"""
+"""The style of all figures, and the content of a file with one."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable
 from functools import wraps
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, ParamSpec
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 P = ParamSpec('P')
-DPI = 130
-"""Resolution of figures (dots per inch)."""
 _STYLE: Any = {
     'font.size': 9.5,
     'axes.spines.top': False,
@@ -27,6 +23,19 @@ _STYLE: Any = {
     'figure.constrained_layout.w_pad': 0.1,
     'figure.constrained_layout.h_pad': 0.08,
 }
+DPI, POINTS = 130, 72
+"""Resolution of PNG files, and of files without pixels (dots per inch)."""
+_CANVASES = {
+    'png': ('backend_agg', 'FigureCanvasAgg'),
+    'svg': ('backend_svg', 'FigureCanvasSVG'),
+    'pdf': ('backend_pdf', 'FigureCanvasPdf'),
+}
+COMPRESSION = 1
+"""Compression level of PNG files: half the time of the default one, for files a tenth larger."""
+ROUNDS = 4
+"""Largest number of times that a figure is laid out."""
+MARGIN = 0.03
+"""Least room left of the labels (inches)."""
 
 
 def styled() -> Any:
@@ -49,16 +58,6 @@ def picture(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     return drawn
 
 
-ROUNDS = 4
-"""Largest number of times that a figure is laid out."""
-MARGIN = 0.03
-"""Least room left of the labels (inches)."""
-POINTS = 72
-"""Resolution of files without pixels (dots per inch)."""
-COMPRESSION = 1
-"""Compression level of PNG files: half the time of the default one, for files a tenth larger."""
-
-
 def render(drawing: Figure, ending: str) -> bytes:
     """Draw a figure and return the content of a file.
 
@@ -74,26 +73,14 @@ def render(drawing: Figure, ending: str) -> bytes:
         ModuleNotFoundError: matplotlib is not installed.
     """
     content = io.BytesIO()
-    # Their methods have no type hints.
-    canvas: Any
+    module, name = _CANVASES[ending]
+    canvas = getattr(import_module(f'matplotlib.backends.{module}'), name)(drawing)
     if ending == 'png':
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-        canvas = FigureCanvasAgg(drawing)
         _lay_out(drawing, DPI)
         canvas.print_png(content, pil_kwargs={'compress_level': COMPRESSION})
-    elif ending == 'svg':
-        from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-        canvas = FigureCanvasSVG(drawing)
-        _lay_out(drawing, POINTS)
-        canvas.print_svg(content)
     else:
-        from matplotlib.backends.backend_pdf import FigureCanvasPdf
-
-        canvas = FigureCanvasPdf(drawing)
         _lay_out(drawing, POINTS)
-        canvas.print_pdf(content)
+        getattr(canvas, f'print_{ending}')(content)
     return content.getvalue()
 
 

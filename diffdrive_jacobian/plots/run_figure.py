@@ -1,9 +1,4 @@
-"""A figure of one or several runs.
-
-It shows the paths in the plane, and over time the distance to the goal, the bearing error, v, omega and
-the wheel speeds with their limits. Where the heading of a goal counts, its error is beside that of the
-bearing. matplotlib is imported when it is drawn. No display is needed.
-"""
+"""A figure of one or several runs: paths in the plane, and quantities over time with their limits."""
 
 from __future__ import annotations
 
@@ -13,53 +8,24 @@ from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from itertools import cycle, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from diffdrive_jacobian.bags.run import Run
+from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.bags.time_series import commanded, limits, line, measured
-from diffdrive_jacobian.bags.timeline import Array, Timeline, jumps, timeline, tolerance
+from diffdrive_jacobian.bags.timeline import Array, Timeline, jumps, seconds, timeline, tolerance
 from diffdrive_jacobian.messages.topics import SENSORS
-from diffdrive_jacobian.plots.fault_marks import ViolationMark, mark_faults
-from diffdrive_jacobian.plots.output_files import FORMATS, create
+from diffdrive_jacobian.plots.output_files import FORMATS, create, extension
 from diffdrive_jacobian.plots.rendering import render, styled
-from diffdrive_jacobian.plots.uncertainty import draw_uncertainty, uncertainty_marks
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.lines import Line2D
-
-__all__ = ['draw', 'figure']
-
-STYLE: Any = (0, (1, 1))
-WIDTH, COLOR = 1.8, '#222222'
-
-
-def draw_ground_truth(plane: Axes, run: Run, color: str = COLOR) -> None:
-    """Draw the true path with its end, if it was recorded."""
-    series = run.ground_truth
-    if not len(series):
-        return
-    places = series.values[:, :2]
-    plane.plot(*line(places, jumps(series)).T, color=color, ls=STYLE, lw=WIDTH, zorder=2.2)
-    plane.plot(*places[-1], 'D', ms=6, mfc='white', mec=color, mew=1.5, zorder=5)
-
-
-def ground_truth_mark(color: str = COLOR) -> Line2D:
-    """Return the legend of the true path."""
-    from matplotlib.lines import Line2D
-
-    label = 'ground truth and its end'
-    return Line2D(
-        [], [], ls=STYLE, lw=WIDTH, color=color, marker='D', ms=6, mfc='white', mew=1.5, label=label
-    )
-
+from diffdrive_jacobian.plots.uncertainty import distance_travelled, draw_uncertainty, uncertainty_marks
+from diffdrive_jacobian.text import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
+
+__all__ = ['draw', 'figure']
 
 SIZE = (11.0, 7.0)
 """Size of the figure (inches)."""
@@ -80,6 +46,16 @@ LIMIT = (0, (6, 3))
 HEADING = (0, (1, 1.2))
 GREY, COMMAND = '#777777', '#d2d2d2'
 PLANNED, PLANNED_POINTS = '#c8b273', 2000
+COLOR = '#222222'
+"""Color of the ground truth of a single run. Of several each has that of its path."""
+TRUTH: Any = {'ls': (0, (1, 1)), 'lw': 1.8}
+"""Line of the ground truth."""
+FAULT_COLORS, FAULT_ALPHA = ('#E69F00', '#56B4E9', '#CC79A7', '#F0E442', '#009E73'), 0.25
+"""Colors of the faults. Later ones share them."""
+VIOLATION = '#B00020'
+"""Color of violations."""
+NAMED, FAULT_LABEL = 6, 60
+"""Number of faults that the legend names, and length beyond which a name is cut."""
 _FIXED = {
     'distance': 'distance to goal [m]',
     'bearing_error': 'bearing error [rad]',
@@ -107,6 +83,26 @@ _ARROW: Any = {
 }
 
 
+class FaultSpan(NamedTuple):
+    """When a fault was there."""
+
+    fault: str
+    """The fault as Python source."""
+    begin: float
+    """Time on the axis of the figure (s)."""
+    end: float
+    """End (s); that of the run if it is not known."""
+
+
+class ViolationMark(NamedTuple):
+    """When a property was violated."""
+
+    time: int
+    """Time of the recorder's clock (ns)."""
+    label: str
+    """The property, for the legend."""
+
+
 def draw(
     runs: Sequence[Run],
     path: Path,
@@ -131,7 +127,7 @@ def draw(
         OSError: The file cannot be written.
         ValueError: The path has another ending.
     """
-    ending = path.suffix.lower().removeprefix('.')
+    ending = extension(path)
     if ending not in FORMATS:
         raise ValueError(f'{path} must end in .{", .".join(FORMATS)}')
     if path.exists() and not replace:
@@ -169,7 +165,7 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
     timelines = [timeline(run) for run in runs]
     quantities = [
         *(('distance', 'bearing_error') if any(len(run.goals) for run in runs) else ()),
-        *path_quantities(timelines),
+        *_path_quantities(timelines),
         *('v', 'omega'),
         *(('right', 'left') if any(len(run.wheels) + len(run.wheel_commands) for run in runs) else ()),
         *(
@@ -196,8 +192,8 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
             timelines, labels, cycle(COLORS), cycle(STYLES), strict=False
         ):
             _draw_path(plane, one, label, color, style)
-            draw_ground_truth(plane, one.run, *([color] if len(runs) > 1 else []))
-            draw_planned_paths(plane, one)
+            _draw_ground_truth(plane, one.run, COLOR if len(runs) == 1 else color)
+            _draw_planned_paths(plane, one)
             for quantity, panel in panels.items():
                 _draw_over_time(panel, one, quantity, color, style, alone=len(runs) == 1)
         if len(runs) == 1:
@@ -206,18 +202,16 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
         _finish(plane, timelines)
         below = drawing.add_subplot(grid[-1, :])
         below.axis('off')
-        marks = [*_marks(timelines), *(uncertainty_marks() if uncertain else [])]
+        marks = _marks(timelines, uncertain=uncertain)
         if len(runs) == 1:
-            mark_faults(drawing, list(panels.values()), timelines[0], violations)
-        if any(len(run.ground_truth) for run in runs):
-            marks.append(ground_truth_mark(*([GREY] if len(runs) > 1 else [])))
+            _mark_faults(drawing, panels.values(), timelines[0], violations)
         below.legend(handles=marks, loc='center', ncol=4 if uncertain else 6, borderaxespad=0.0)
         if notes := _notes(runs, labels):
             drawing.supxlabel(notes, fontsize=8.0, color=GREY)
     return drawing
 
 
-def path_quantities(timelines: Sequence[Timeline]) -> tuple[str, ...]:
+def _path_quantities(timelines: Sequence[Timeline]) -> tuple[str, ...]:
     """Return the two errors that are drawn: along where there is a trajectory, else of the heading."""
     if not any(one.paths for one in timelines):
         return ()
@@ -225,7 +219,7 @@ def path_quantities(timelines: Sequence[Timeline]) -> tuple[str, ...]:
     return 'across', 'along' if trajectory else 'path_heading_error'
 
 
-def draw_planned_paths(plane: Axes, one: Timeline) -> None:
+def _draw_planned_paths(plane: Axes, one: Timeline) -> None:
     """Draw the paths that were sent, below the path that was driven."""
     for path in one.paths:
         places = path.poses_at(np.linspace(0.0, path.length, PLANNED_POINTS))[:, :2]
@@ -265,10 +259,7 @@ def _panels(drawing: Figure, grid: Any, quantities: Sequence[str], columns: int)
 
 def _draw_path(plane: Axes, one: Timeline, name: str, color: str, style: Any) -> None:
     """Draw the path with evenly spaced headings, its start and its end."""
-    poses = one.run.odometry.values[:, :3]
-    steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-    steps[one.breaks - 1] = 0.0
-    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    poses, travelled = one.run.odometry.values[:, :3], distance_travelled(one)
     name = name if len(name) <= LABEL else f'{name[: LABEL // 2]}…{name[-LABEL // 2 :]}'
     # matplotlib reads a dollar as a formula, and hides labels that start with an underscore.
     label = f'{name}: {np.ptp(one.time):.1f} s, {travelled[-1]:.2f} m'.replace('$', r'\$')
@@ -280,6 +271,14 @@ def _draw_path(plane: Axes, one: Timeline, name: str, color: str, style: Any) ->
     x, y, _ = poses[[0, *one.breaks[:MARKED]]].T
     plane.plot(x, y, 'o', ms=9, mfc='white', mec=color, mew=1.8, zorder=2.5)
     plane.plot(*poses[-1, :2], 's', ms=7, mfc=color, mec='white', mew=0.8, zorder=5)
+
+
+def _draw_ground_truth(plane: Axes, run: Run, color: str) -> None:
+    """Draw the true path with its end, if it was recorded."""
+    if len(run.ground_truth):
+        places = run.ground_truth.values[:, :2]
+        plane.plot(*line(places, jumps(run.ground_truth)).T, color=color, zorder=2.2, **TRUTH)
+        plane.plot(*places[-1], 'D', ms=6, mfc='white', mec=color, mew=1.5, zorder=5)
 
 
 def _draw_goals(plane: Axes, timelines: Sequence[Timeline]) -> None:
@@ -336,14 +335,10 @@ def _draw_over_time(
     elif alone:
         panel.plot(*command.T, color=COMMAND, lw=4.5, drawstyle='steps-post', zorder=1.5)
     panel.plot(*measurement.T, color=color, ls=style, lw=1.5)
-    if quantity == 'bearing_error' and _heading_counts(one):
+    if quantity == 'bearing_error' and np.isfinite(one.goal_heading_error).any():
         panel.plot(*measured(one, 'goal_heading_error').T, color=color, ls=HEADING, lw=2.2)
     for bound in limits(one).get(quantity, ()):
         panel.plot(*bound.T, color='black', ls=LIMIT, lw=1.0, drawstyle='steps-post', zorder=3)
-
-
-def _heading_counts(one: Timeline) -> bool:
-    return bool(np.isfinite(one.goal_heading_error).any())
 
 
 def _draw_goal_changes(panels: Iterable[Axes], one: Timeline) -> None:
@@ -375,27 +370,90 @@ def _finish(plane: Axes, timelines: Sequence[Timeline]) -> None:
     )
 
 
-def _marks(timelines: Sequence[Timeline]) -> list[Line2D]:
+def _marks(timelines: Sequence[Timeline], *, uncertain: bool) -> list[Any]:
     """Return the legend of the marks that were drawn."""
     from matplotlib.lines import Line2D
 
-    alone = len(timelines) == 1
-    marks = [
-        Line2D([], [], ls='', marker='o', ms=9, mfc='white', mew=1.8, color=GREY, label='start'),
-        Line2D([], [], ls='', marker='s', ms=7, color=GREY, label='end'),
-    ]
+    alone, marks = len(timelines) == 1, list[Any]()
+
+    def mark(label: str, **style: Any) -> None:
+        marks.append(Line2D([], [], label=label, **{'color': GREY, **style}))
+
+    mark('start', ls='', marker='o', ms=9, mfc='white', mew=1.8)
+    mark('end', ls='', marker='s', ms=7)
     if any(len(one.run.goals) for one in timelines):
-        label = 'goal with its tolerance'
-        marks.append(Line2D([], [], ls='', marker=r'$\oplus$', ms=12, color='black', label=label))
+        mark('goal with its tolerance', ls='', marker=r'$\oplus$', ms=12, color='black')
     if any(one.paths for one in timelines):
-        marks.append(Line2D([], [], lw=5.0, color=PLANNED, alpha=0.6, label='planned path'))
+        mark('planned path', lw=5.0, color=PLANNED, alpha=0.6)
     if alone and 0 < np.count_nonzero(np.diff(timelines[0].goal)) <= MARKED:
-        marks.append(Line2D([], [], ls=':', lw=0.9, color=GREY, label='goal begins or ends'))
+        mark('goal begins or ends', ls=':', lw=0.9)
     if alone and any(len(commanded(timelines[0], quantity)) for quantity in LABELS):
-        marks.append(Line2D([], [], lw=4.5, color=COMMAND, label='commanded'))
-    if any(map(_heading_counts, timelines)):
-        label = 'error of the heading at the goal'
-        marks.append(Line2D([], [], ls=HEADING, lw=2.2, color=GREY, label=label))
+        mark('commanded', lw=4.5, color=COMMAND)
+    if any(np.isfinite(one.goal_heading_error).any() for one in timelines):
+        mark('error of the heading at the goal', ls=HEADING, lw=2.2)
     if any(np.isfinite(bounds[..., 1]).any() for one in timelines for bounds in limits(one).values()):
-        marks.append(Line2D([], [], ls=LIMIT, lw=1.0, color='black', label='limit'))
+        mark('limit', ls=LIMIT, lw=1.0, color='black')
+    marks += uncertainty_marks() if uncertain else []
+    if any(len(one.run.ground_truth) for one in timelines):
+        color = {'color': COLOR} if alone else {}
+        mark('ground truth and its end', marker='D', ms=6, mfc='white', mew=1.5, **TRUTH, **color)
     return marks
+
+
+# --- Faults of a lockstep world
+
+
+def fault_spans(one: Timeline) -> list[FaultSpan]:
+    """Return when the faults of a run began and ended, in the order in which they began."""
+    run = one.run
+    begun: dict[str, float] = {}
+    spans: list[FaultSpan] = []
+    times = _times(run, [event[0] for event in run.fault_events])
+    for (_, fault, what), time in zip(run.fault_events, times, strict=True):
+        if not what.startswith('ends'):
+            begun.setdefault(fault, time)
+        elif fault in begun:
+            spans.append(FaultSpan(fault, begun.pop(fault), time))
+    last = float(one.time[-1])
+    spans += [FaultSpan(fault, begin, max(begin, last)) for fault, begin in begun.items()]
+    return sorted(spans, key=lambda span: span.begin)
+
+
+def _times(run: Run, recorded: Sequence[int]) -> list[float]:
+    """Return when events were recorded (ns) as times on the axis of the figure (s)."""
+    received = np.array(recorded, dtype=np.int64)
+    series = Series(received=received, stamps=received, values=np.empty((len(received), 0)))
+    return [float(time) for time in seconds(run, series)]
+
+
+def _mark_faults(
+    drawing: Figure, panels: Iterable[Axes], one: Timeline, violations: Sequence[ViolationMark]
+) -> None:
+    """Draw faults as bands and violations as lines into axes over time, and add their legend."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    spans = [*zip(fault_spans(one), cycle(FAULT_COLORS), strict=False)]
+    times = _times(one.run, [violation.time for violation in violations])
+    style: Any = {'color': VIOLATION, 'lw': 1.6, 'ls': '--'}
+    for panel in panels:
+        for span, color in spans:
+            panel.axvspan(span.begin, span.end, color=color, alpha=FAULT_ALPHA, lw=0.0, zorder=0.5)
+            panel.axvline(span.begin, color=color, lw=1.2, zorder=0.6)
+        for time in times:
+            panel.axvline(time, zorder=4, **style)
+    handles: list[Any] = [
+        Patch(color=color, alpha=2.0 * FAULT_ALPHA, label=_fault_label(span.fault))
+        for span, color in spans[:NAMED]
+    ]
+    if len(spans) > NAMED:
+        handles[-1].set_label(f'and {len(spans) - NAMED + 1} more faults')
+    handles += [Line2D([], [], label=_fault_label(one.label), **style) for one in violations]
+    if handles:
+        drawing.legend(handles=handles, loc='outside upper right', ncol=2, fontsize=8.0)
+
+
+def _fault_label(name: str) -> str:
+    name = printable(name)
+    # matplotlib reads a dollar as a formula.
+    return (name if len(name) <= FAULT_LABEL else f'{name[: FAULT_LABEL - 1]}…').replace('$', r'\$')

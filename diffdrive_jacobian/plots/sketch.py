@@ -1,8 +1,8 @@
 """Elements of drawings to scale: vectors, frames, angles, dimensions, and the robot from above.
 
-Coordinates are those of the drawing (m). Labels are TeX in the style of matplotlib, and are moved from
-where they belong by an offset in points, so that they keep clear of lines at every scale. matplotlib is
-imported when something is drawn.
+Coordinates are those of the drawing (m). Labels are TeX in the style of matplotlib. They are moved from
+where they belong by an offset (points), so that they keep clear of lines at every scale. `style` has
+properties of the line, arrow or text.
 """
 
 from __future__ import annotations
@@ -31,51 +31,20 @@ TYRE = 0.1
 
 
 def canvas(width: float, x: tuple[float, float], y: tuple[float, float]) -> tuple[Figure, Axes]:
-    """Return a figure with equal scales and without axes.
-
-    Args:
-        width: Its width (inches).
-        x: Its left and right end.
-        y: Its lower and upper end.
-    """
+    """Return a figure of a width (inches) from end to end along x and y, without visible axes."""
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(width, width * (y[1] - y[0]) / (x[1] - x[0])))
-    return drawing, panel(drawing, (0.0, 0.0, 1.0, 1.0), x, y)
-
-
-def panel(
-    drawing: Figure,
-    place: tuple[float, float, float, float],
-    x: tuple[float, float],
-    y: tuple[float, float],
-) -> Axes:
-    """Return a part of a figure with equal scales and without axes.
-
-    Args:
-        drawing: The figure.
-        place: Left, bottom, width and height in it, each from 0 to 1.
-        x: Left and right end in the coordinates of the drawing.
-        y: Lower and upper end.
-    """
-    axes = drawing.add_axes(place)
+    axes = drawing.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=x, ylim=y, aspect='equal')
     axes.set_axis_off()
-    return axes
+    return drawing, axes
 
 
 def label(
     axes: Axes, text: str, at: ArrayLike, offset: tuple[float, float] = (0.0, 0.0), **style: Any
 ) -> None:
-    """Write a text.
-
-    Args:
-        axes: Where.
-        text: The text.
-        at: Where its middle belongs.
-        offset: How far it is moved from there (points).
-        style: Style of the text.
-    """
+    """Write a text with its middle at a place, moved by an offset (points)."""
     x, y = np.asarray(at, dtype=np.float64)
     style = {'ha': 'center', 'va': 'center', 'fontsize': LABEL, **style}
     axes.annotate(text, (x, y), offset, textcoords='offset points', **style)
@@ -105,16 +74,7 @@ def arrow(
     offset: tuple[float, float] = (0.0, 0.0),
     **style: Any,
 ) -> None:
-    """Draw a vector with a label at its tip.
-
-    Args:
-        axes: Where.
-        start: Where it begins.
-        vector: From its start to its tip.
-        text: Its label.
-        offset: How far the label is moved from the tip (points).
-        style: `color`, `lw` and other properties of the arrow.
-    """
+    """Draw a vector from a start, with a label at its tip, moved by an offset (points)."""
     x, y = np.asarray(start, dtype=np.float64)
     dx, dy = np.asarray(vector, dtype=np.float64)
     style = {'arrowstyle': '-|>', 'mutation_scale': 12.0, 'lw': 1.6, 'color': INK, **style}
@@ -124,16 +84,7 @@ def arrow(
 
 
 def frame(axes: Axes, pose: ArrayLike, length: float, x: str, y: str, **style: Any) -> None:
-    """Draw the axes of a frame with their labels at the tips.
-
-    Args:
-        axes: Where.
-        pose: Pose of the frame.
-        length: Length of its axes.
-        x: Label of the x axis.
-        y: Label of the y axis.
-        style: Style of the arrows.
-    """
+    """Draw the axes of a frame at a pose, with the labels x and y at their tips."""
     origin, apart = placed([0.0, 0.0], pose), 11.0
     for direction, text in (([length, 0.0], x), ([0.0, length], y)):
         tip = placed(direction, pose)
@@ -144,17 +95,7 @@ def frame(axes: Axes, pose: ArrayLike, length: float, x: str, y: str, **style: A
 def angle(
     axes: Axes, centre: ArrayLike, radius: float, start: float, end: float, text: str, **style: Any
 ) -> None:
-    """Draw an angle as an arc with an arrow, and its label in the middle, outside the arc.
-
-    Args:
-        axes: Where.
-        centre: Centre of the arc.
-        radius: Its radius.
-        start: Direction in which it begins (rad).
-        end: Direction in which it ends (rad).
-        text: Its label.
-        style: Style of the line.
-    """
+    """Draw an angle (rad) as an arc with an arrow, and its label in the middle, outside the arc."""
     middle, over = np.asarray(centre, dtype=np.float64), (start + end) / 2.0
     directions = np.linspace(start, end, 60)
     arc = middle + radius * np.column_stack([np.cos(directions), np.sin(directions)])
@@ -169,16 +110,7 @@ def angle(
 def dimension(
     axes: Axes, start: ArrayLike, end: ArrayLike, aside: float, text: str, **style: Any
 ) -> None:
-    """Draw a distance as a line with two arrows beside it, and its label.
-
-    Args:
-        axes: Where.
-        start: One end.
-        end: The other end.
-        aside: How far the line is to the left of the way from start to end.
-        text: Its label.
-        style: Style of the label.
-    """
+    """Draw a distance as a line with two arrows, so far to the left of it, and its label."""
     a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     left = np.array([a[1] - b[1], b[0] - a[0]]) / np.hypot(*(b - a))
     for one in (a, b):
@@ -189,12 +121,7 @@ def dimension(
 
 
 def placed(points: ArrayLike, pose: ArrayLike) -> NDArray[np.float64]:
-    """Return points of a frame in the coordinates of the drawing: `H [x, y, 1]`.
-
-    Args:
-        points: Points, shape (..., 2).
-        pose: Pose of the frame, shape (3,).
-    """
+    """Return points of a frame at a pose in coordinates of the drawing, shape (..., 2)."""
     H = se2.homogeneous(pose)
     placed_points: NDArray[np.float64] = np.asarray(points, dtype=np.float64) @ H[:2, :2].T + H[:2, 2]
     return placed_points
@@ -209,20 +136,13 @@ def outline(axes: Axes, points: ArrayLike, **style: Any) -> None:
 
 
 def robot(axes: Axes, pose: ArrayLike, r: float, L: float) -> None:
-    """Draw a robot from above: its body, its axle and its wheels, which are 2 r long.
-
-    Args:
-        axes: Where.
-        pose: Pose of the robot.
-        r: Wheel radius.
-        L: Wheel separation.
-    """
+    """Draw a robot with wheel radius r and separation L from above: body, axle and wheels."""
     outline(axes, placed(L * BODY, pose), fc=FILL, ec=GREY)
     wheels(axes, pose, r, L)
 
 
 def wheels(axes: Axes, pose: ArrayLike, r: float, L: float) -> None:
-    """Draw the wheels of a robot from above with their axle. Arguments as for `robot`."""
+    """Draw the wheels of a robot from above with their axle."""
     line(axes, *placed([[0.0, -L / 2.0], [0.0, L / 2.0]], pose), lw=2.0, color=GREY)
     half = TYRE * L / 2.0
     for side in (-L / 2.0, L / 2.0):

@@ -1,7 +1,4 @@
-"""A sweep of gains as one picture: heat maps of time to goal, path length and overshoot.
-
-matplotlib is imported when something is drawn; no display is needed.
-"""
+"""A sweep of gains as one picture: heat maps of time to goal, path length and overshoot."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diffdrive_jacobian.control.controller import KP, KV, Gain
+from diffdrive_jacobian.control.controller import KP, KV, Boundary, Gain
 from diffdrive_jacobian.plots.rendering import render, styled
 from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -45,11 +42,7 @@ DASHES = (0, (5, 2))
 
 
 def draw(swept: Sweep, ending: str) -> bytes:
-    """Draw a sweep and return the content of a file.
-
-    Args:
-        swept: The sweep.
-        ending: Format, `png`, `svg` or `pdf`.
+    """Draw a sweep and return the content of a `png`, `svg` or `pdf` file.
 
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
@@ -74,7 +67,9 @@ def figure(swept: Sweep) -> Figure:
         for panel, (measure, title) in zip(panels, TITLES.items(), strict=True):
             _draw_map(drawn, panel, swept, measure)
             _draw_boundary(panel, swept.setup)
-            _draw_marks(panel, swept)
+            for mark in _marks(swept):
+                mark.set_clip_on(False)
+                panel.add_line(mark)
             panel.set_title(title, pad=10.0)
             panel.set_xlabel(_label(swept.setup.axes[0]))
         panels[0].set_ylabel(_label(swept.setup.axes[1]))
@@ -143,14 +138,8 @@ def _draw_map(drawn: Figure, panel: Axes, swept: Sweep, measure: str) -> None:
     low, high = _range(found, from_zero=measure == 'overshoot')
     logarithmic = low > 0.0 and high / low > LOGARITHMIC_RATIO
     norm: Any = LogNorm(low, high) if logarithmic else Normalize(low, high)
-    mesh = panel.pcolormesh(
-        _edges(swept.x),
-        _edges(swept.y),
-        values,
-        norm=norm,
-        cmap=COLORS,
-        rasterized=True,
-    )
+    edges = _edges(swept.x), _edges(swept.y)
+    mesh = panel.pcolormesh(*edges, values, norm=norm, cmap=COLORS, rasterized=True)
     panel.set(xlim=swept.x[[0, -1]], ylim=swept.y[[0, -1]], facecolor=EMPTY)
     panel.patch.set(hatch='////', edgecolor='white', lw=0.0)
     panel.grid(False)
@@ -185,8 +174,8 @@ def _draw_boundary(panel: Axes, setup: SweepSetup) -> None:
     """Draw the boundary of the controller where it lies in the picture, with its equation if it fits."""
     from matplotlib.patheffects import withStroke
 
-    boundary, (low, high) = setup.resolved_controller.boundary, _visible_boundary(setup)
-    if boundary is None or not low < high:
+    boundary, (low, high) = _visible_boundary(setup)
+    if boundary is None:
         return
     ratio, kv = boundary.ratio, np.array([low, high])
     panel.plot(ratio * kv, kv, color=LIT, lw=3.6, alpha=0.55)
@@ -207,23 +196,18 @@ def _draw_boundary(panel: Axes, setup: SweepSetup) -> None:
         )
 
 
-def _visible_boundary(setup: SweepSetup) -> tuple[float, float]:
-    """Return the first and the last kv of the boundary in the picture; not ascending: there is none."""
+def _visible_boundary(setup: SweepSetup) -> tuple[Boundary | None, tuple[float, float]]:
+    """Return the boundary with its first and last kv in the picture; None: it is not in it."""
     boundary = setup.resolved_controller.boundary
     if boundary is None or setup.axes != (KP, KV):
-        return 0.0, 0.0
+        return None, (0.0, 0.0)
     kp, kv = setup.ends(KP), setup.ends(KV)
-    return max(kp[0] / boundary.ratio, kv[0]), min(kp[1] / boundary.ratio, kv[1])
-
-
-def _draw_marks(panel: Axes, swept: Sweep) -> None:
-    """Mark the reference gains and the fastest ones."""
-    for mark in _marks(swept):
-        mark.set_clip_on(False)
-        panel.add_line(mark)
+    low, high = max(kp[0] / boundary.ratio, kv[0]), min(kp[1] / boundary.ratio, kv[1])
+    return boundary if low < high else None, (low, high)
 
 
 def _marks(swept: Sweep) -> list[Line2D]:
+    """Return the marks of the reference gains and of the fastest ones."""
     from matplotlib.lines import Line2D
 
     marks = []
@@ -243,14 +227,13 @@ def _marks(swept: Sweep) -> list[Line2D]:
 
 
 def _legend(swept: Sweep) -> list[Any]:
-    """Return the entries of the legend."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     setup = swept.setup
     entries: list[Any] = []
-    boundary, (low, high) = setup.resolved_controller.boundary, _visible_boundary(setup)
-    if boundary is not None and low < high:
+    boundary, _ = _visible_boundary(setup)
+    if boundary is not None:
         label = f'{boundary.equation}: {boundary.beyond}'
         entries.append(Line2D([], [], color=LINE, lw=1.6, ls=DASHES, label=label))
     entries += _marks(swept)

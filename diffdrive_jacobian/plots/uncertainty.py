@@ -61,9 +61,7 @@ def uncertainties(one: Timeline, places: int = PLACES) -> list[Uncertainty]:
         return []
     begins = [0, *one.breaks.tolist()]
     found = []
-    steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-    steps[one.breaks - 1] = 0.0
-    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    travelled = distance_travelled(one)
     wanted = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], places + 1)[1:])
     wanted = np.unique([*wanted.tolist(), len(poses) - 1])
     for begin, end in zip(begins, [*begins[1:], len(poses)], strict=True):
@@ -71,6 +69,13 @@ def uncertainties(one: Timeline, places: int = PLACES) -> list[Uncertainty]:
         if len(here):
             found += _along(poses, covariances, _knots(poses, begin, here), here)
     return found
+
+
+def distance_travelled(one: Timeline) -> Array:
+    """Return the length of the path up to each odometry message, shape (n,) (m)."""
+    steps = np.hypot(*np.diff(one.run.odometry.values[:, :2], axis=0).T)
+    steps[one.breaks - 1] = 0.0
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def draw_uncertainty(plane: Axes, one: Timeline) -> bool:
@@ -88,10 +93,9 @@ def draw_uncertainty(plane: Axes, one: Timeline) -> bool:
             np.linspace(left - margin, right + margin, GRID),
             np.linspace(low - margin, high + margin, GRID),
         )
-        region = uncertainty.region
-        distance = region_distance(region, np.stack([x, y], axis=-1))
         # The square root is nearly linear across the outline.
-        root, edge = np.sqrt(distance), float(np.sqrt(region.level))
+        root = np.sqrt(region_distance(uncertainty.region, np.stack([x, y], axis=-1)))
+        edge = float(np.sqrt(uncertainty.region.level))
         plane.contourf(x, y, root, [0.0, edge], colors=[FILL], alpha=0.5, zorder=1.2)
         plane.contour(x, y, root, [edge], colors=[OUTLINE], linewidths=0.9, zorder=1.3)
         plane.plot(*_ellipse(uncertainty).T, color=ELLIPSE, lw=0.9, ls='--', zorder=1.4)

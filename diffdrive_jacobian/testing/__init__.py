@@ -46,8 +46,7 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep.external.node_process import NodeProcess
     from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.nodes.goal_client import path_message
-    from diffdrive_jacobian.testing.golden_run import GoldenRun
-    from diffdrive_jacobian.testing.recorded_run import RecordedRun
+    from diffdrive_jacobian.testing.recorded_run import GoldenRun, RecordedRun
     from diffdrive_jacobian.testing.repeats import check_repeats
 
 __all__ = [
@@ -94,8 +93,7 @@ _MODULES = {
     'lockstep.external.node_process': ('NodeProcess',),
     'lockstep.world': ('Lockstep',),
     'nodes.goal_client': ('path_message',),
-    'testing.golden_run': ('GoldenRun',),
-    'testing.recorded_run': ('RecordedRun',),
+    'testing.recorded_run': ('GoldenRun', 'RecordedRun'),
     'testing.repeats': ('check_repeats',),
 }
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import os
 import re
 import sys
 import warnings
@@ -26,8 +25,7 @@ import pytest
 if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-    from diffdrive_jacobian.testing.golden_run import GoldenRun
-    from diffdrive_jacobian.testing.recorded_run import RecordedRun
+    from diffdrive_jacobian.testing.recorded_run import GoldenRun, RecordedRun
 
 MAX_LENGTH = 120
 """Length of the longest name. A name in a directory can have 255 bytes."""
@@ -118,9 +116,9 @@ def _check_fields(config: pytest.Config) -> None:
     if not config.getini('lockstep_check_fields') or config.stash.get(_CHECKS_FIELDS, False):
         return
     config.stash[_CHECKS_FIELDS] = True
-    before = os.environ.get(CHECK_FIELDS)
-    os.environ[CHECK_FIELDS] = '1'
-    config.add_cleanup(lambda: _set_environment(CHECK_FIELDS, before))
+    environment = pytest.MonkeyPatch()
+    environment.setenv(CHECK_FIELDS, '1')
+    config.add_cleanup(environment.undo)
     unchecked = sorted(
         {
             name.partition('.')[0]
@@ -139,13 +137,6 @@ def _check_fields(config: pytest.Config) -> None:
         )
 
 
-def _set_environment(name: str, value: str | None) -> None:
-    if value is None:
-        os.environ.pop(name, None)
-    else:
-        os.environ[name] = value
-
-
 # --- Reports
 
 
@@ -158,7 +149,7 @@ def pytest_runtest_call(item: pytest.Item) -> None:
     from diffdrive_jacobian.lockstep._errors import LockstepError
     from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.recording.recording import RecordingError
-    from diffdrive_jacobian.testing.golden_run import GoldenRun, GoldenRunError
+    from diffdrive_jacobian.testing.recorded_run import GoldenRun, GoldenRunError
 
     try:
         if isinstance(world, Lockstep) and world.is_open:
@@ -274,13 +265,26 @@ def _remedy(error: ImportError) -> str:
 
 @pytest.fixture
 def robot_at(lockstep: Lockstep) -> Callable[..., VirtualRobot]:
-    """Return a function that adds a virtual robot with a pose, a namespace and parameters."""
-    from diffdrive_jacobian.testing.robot_at import place_robot
+    """Return a function that adds a virtual robot with a pose, a namespace and parameters.
+
+    A parameter is given by its name, with `__` for each dot. TypeError: there is no such parameter.
+    """
+    from rclpy.parameter import Parameter
+
+    from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+    from diffdrive_jacobian.parameters.declaration import specifications
+    from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 
     def place(
         x: float = 0.0, y: float = 0.0, theta: float = 0.0, *, namespace: str = '', **parameters: Any
     ) -> VirtualRobot:
-        return place_robot(lockstep, x, y, theta, namespace, parameters)
+        values = {'x': float(x), 'y': float(y), 'theta': float(theta)}
+        values |= {name.replace('__', '.'): value for name, value in parameters.items()}
+        known = specifications(VirtualRobotParameters)
+        if unknown := sorted(set(values) - set(known)):
+            raise TypeError(f'virtual_robot has no parameter {unknown[0]!r}; it has {", ".join(known)}')
+        overrides = [Parameter(name, value=value) for name, value in values.items()]
+        return lockstep.create(lambda: VirtualRobot(namespace=namespace, parameter_overrides=overrides))
 
     return place
 
@@ -312,7 +316,7 @@ def _artifacts(config: pytest.Config, tmp_path_factory: pytest.TempPathFactory) 
 @pytest.fixture
 def golden_run(recorded_run: RecordedRun, request: pytest.FixtureRequest) -> GoldenRun:
     """Compare the test with its golden run, when it has passed. `check()` does so with a tolerance."""
-    from diffdrive_jacobian.testing.golden_run import GoldenRun
+    from diffdrive_jacobian.testing.recorded_run import GoldenRun
 
     test = request.node.nodeid
     path = request.path.parent / GOLDEN / name_beside_the_file(test)

@@ -25,7 +25,7 @@ from diffdrive_jacobian.tools._startup import long_lived
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.drives import Outcome
-    from diffdrive_jacobian.live.goal_progress import GoalEnd
+    from diffdrive_jacobian.live.robot_state import GoalEnd
     from diffdrive_jacobian.recording.recording import Recording
 
 PROGRAM = 'drive_to'
@@ -138,7 +138,7 @@ def _drive_with_page(
     recording, given = None, bool(options.coordinates or options.path)
     try:
         with _page.explaining_page_errors(options.port):
-            from diffdrive_jacobian.live.running import drive_live
+            from diffdrive_jacobian.live.node import drive_live
 
         recording = _recording(options)
         # Where the page cannot be served, the recording is discarded.

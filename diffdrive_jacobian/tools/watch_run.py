@@ -32,7 +32,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
 
 def _bag(options: argparse.Namespace, signals: Signals) -> int:
     from diffdrive_jacobian.bags.bag_reader import BagError
-    from diffdrive_jacobian.live.serving import watch_bag
+    from diffdrive_jacobian.live.bag_player import watch_bag
 
     print(f'reading {options.bag}', flush=True)
     try:
@@ -50,7 +50,7 @@ def _bag(options: argparse.Namespace, signals: Signals) -> int:
 
 def _nodes(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
     with long_lived(), signals.ending_at_once():
-        from diffdrive_jacobian.live.running import watch_nodes
+        from diffdrive_jacobian.live.node import watch_nodes
 
     try:
         watch_nodes(

@@ -15,8 +15,7 @@ from diffdrive_jacobian.bags.run_reader import read_run
 from diffdrive_jacobian.bags.time_series import commanded, measured
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.faults import Push, TimeJump
-from diffdrive_jacobian.plots.fault_marks import NAMED, fault_spans
-from diffdrive_jacobian.plots.run_figure import figure
+from diffdrive_jacobian.plots.run_figure import NAMED, fault_spans, figure
 from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
 

@@ -19,7 +19,7 @@ from unique_identifier_msgs.msg import UUID
 
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.bag_reader import open_bag
-from diffdrive_jacobian.testing.golden_run import Comparison, GoldenRun, GoldenRunError
+from diffdrive_jacobian.testing.recorded_run import Comparison, GoldenRun, GoldenRunError
 
 # --- Messages
 

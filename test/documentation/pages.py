@@ -44,7 +44,8 @@ import sysconfig
 import tempfile
 import textwrap
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
@@ -127,12 +128,7 @@ class Session:
     """A page that is run in a directory."""
 
     def __init__(self, directory: Path, commands: Path) -> None:
-        """Run in a ROS domain that other sessions are unlikely to have.
-
-        Args:
-            directory: An empty directory.
-            commands: Where to make the commands of this package.
-        """
+        """Run in an empty directory, with the commands of this package in another one."""
         self._directory = directory
         (directory / 'config').symlink_to(ROOT / 'config')
         scripts = Path(sysconfig.get_path('scripts'))
@@ -144,7 +140,7 @@ class Session:
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
             'ROS_DOMAIN_ID': str(domain_id()),
             'PYTHONUNBUFFERED': '1',
-            # They take longer to import than most tests of the pages run.
+            # These take longer to import than most tests of the pages run.
             'PYTEST_ADDOPTS': '-p no:hypothesispytest -p no:xdist -p no:launch_testing',
         }
 
@@ -171,37 +167,56 @@ class Session:
             command = ['bash', '-c', f'exec {last}']
         with ExitStack() as stack:
             for line in beside:
-                stack.enter_context(Background(line, self._directory, self._environment))
+                stack.enter_context(self._running(line))
             if 'processes' in block.notes:
                 time.sleep(TYPING)
-            output, code = self._completed(command, block)
-        expected = int(block.notes.get('exit', 0))
-        assert code == expected, (
-            f'line {block.line}: exit code {code}, not {expected}:\n{block.code}\n{output}'
-        )
+            process = self._start(command, subprocess.PIPE, start_new_session=True)
+            try:
+                output, _ = process.communicate(timeout=PATIENCE)
+                how, expected = f'exit code {process.returncode}', int(block.notes.get('exit', 0))
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                output, _ = process.communicate()
+                how, expected = f'not within {PATIENCE} s', None
+        assert process.returncode == expected, f'line {block.line}: {how}:\n{block.code}\n{output}'
         return output
 
-    def _completed(self, command: list[str], block: Block) -> tuple[str, int]:
-        """Run a command to its end; return what it printed and its exit code."""
-        process = subprocess.Popen(
+    def _start(self, command: list[str], output: object, **options: bool) -> subprocess.Popen[str]:
+        return subprocess.Popen(
             command,
             cwd=self._directory,
             env=self._environment,
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
+            stdout=output,
             stderr=subprocess.STDOUT,
             text=True,
-            start_new_session=True,
+            **options,
         )
-        try:
-            output, _ = process.communicate(timeout=PATIENCE)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            output, _ = process.communicate()
-            raise AssertionError(
-                f'line {block.line}: not within {PATIENCE} s:\n{block.code}\n{output}'
-            ) from None
-        return output, process.returncode
+
+    @contextmanager
+    def _running(self, command: str) -> Iterator[None]:
+        """Run a command, from its first output on. It has to exit with 0 when it is interrupted."""
+        with tempfile.TemporaryFile(mode='w+') as file:
+            process, passed = self._start(['bash', '-c', f'exec {command}'], file), False
+            try:
+                deadline = time.monotonic() + PATIENCE
+                while os.fstat(file.fileno()).st_size == 0:
+                    assert process.poll() is None, f'{command} printed nothing'
+                    assert time.monotonic() < deadline, f'{command} printed nothing'
+                    time.sleep(0.01)
+                yield
+                passed = True
+            finally:
+                process.send_signal(signal.SIGINT)
+                try:
+                    code = process.wait(PATIENCE)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    code = process.wait()
+                file.seek(0)
+                if code or not passed:
+                    print(f'{command}: exit code {code}\n{file.read()}')
+            assert code == 0, f'{command}: exit code {code}'
 
     def _edit(self, name: str, words: str, replacement: str) -> None:
         path = self._directory / name
@@ -209,49 +224,6 @@ class Session:
         (index,) = [number for number, line in enumerate(lines) if words in line]
         lines[index] = replacement
         path.write_text(''.join(lines))
-
-
-class Background:
-    """A command that runs beside a block, and has to exit with 0 when it is interrupted."""
-
-    def __init__(self, command: str, directory: Path, environment: dict[str, str]) -> None:
-        """Start it, and wait until it has printed something."""
-        self._command = command
-        self._output = tempfile.TemporaryFile(mode='w+')  # noqa: SIM115
-        self._process = subprocess.Popen(
-            ['bash', '-c', f'exec {command}'],
-            cwd=directory,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-        )
-        deadline = time.monotonic() + PATIENCE
-        while os.fstat(self._output.fileno()).st_size == 0:
-            if self._process.poll() is not None or time.monotonic() > deadline:
-                self._process.kill()
-                raise AssertionError(f'{command} printed nothing: exit code {self._process.wait()}')
-            time.sleep(0.01)
-
-    def __enter__(self) -> Background:
-        """Return it."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Interrupt it and check how it ends."""
-        self._process.send_signal(signal.SIGINT)
-        try:
-            code = self._process.wait(PATIENCE)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            code = self._process.wait()
-        self._output.seek(0)
-        text = self._output.read()
-        self._output.close()
-        if kind is not None:
-            print(f'{self._command}\n{text}')
-        else:
-            assert code == 0, f'{self._command}: exit code {code}\n{text}'
 
 
 def is_run(block: Block) -> bool:
@@ -286,31 +258,30 @@ def check_output(quoted: Block, printed: str) -> None:
             assert line in rest, (
                 f'line {quoted.line}: not printed, or not in this order: {line}\n{printed}'
             )
-        return
-    if ELLIPSIS in lines:
-        cut = lines.index(ELLIPSIS)
-        tail = len(lines) - cut - 1
-        real = [*real[:cut], ELLIPSIS, *real[len(real) - tail :]]
-    assert lines == real, f'line {quoted.line}: printed was\n{printed}'
+    else:
+        assert lines == shortened(real, lines), f'line {quoted.line}: printed was\n{printed}'
+
+
+def shortened(real: list[str], quoted: list[str]) -> list[str]:
+    """Return printed lines with `...` for as many as in a quotation."""
+    if ELLIPSIS not in quoted:
+        return real
+    cut = quoted.index(ELLIPSIS)
+    return [*real[:cut], ELLIPSIS, *real[len(real) - len(quoted) + cut + 1 :]]
 
 
 def refreshed(quoted: Block, printed: str) -> str:
-    """Return the code of a quoted output as it should be, cut as it was.
+    """Return the code of a quoted output as it should be, shortened as it was.
 
     A part stays as it is; if it is out of date, that is reported.
     """
-    lines, real = quoted.code.splitlines(), printed.strip().splitlines()
     if 'part' in quoted.notes['output']:
         try:
             check_output(quoted, printed)
         except AssertionError as error:
             print(f'edit by hand: {error}')
         return quoted.code
-    if ELLIPSIS in lines:
-        cut = lines.index(ELLIPSIS)
-        tail = len(lines) - cut - 1
-        real = [*real[:cut], ELLIPSIS, *real[len(real) - tail :]]
-    return '\n'.join(real) + '\n'
+    return '\n'.join(shortened(printed.strip().splitlines(), quoted.code.splitlines())) + '\n'
 
 
 def run_page(text: str, directory: Path) -> list[tuple[Block, str]]:

@@ -16,7 +16,7 @@ from diffdrive_jacobian.kinematics import diff_drive, se2
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.kinematics.inverse_kinematics import solve
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
-from diffdrive_jacobian.plots import null_space_figure, parking, parking_figure
+from diffdrive_jacobian.plots import arm_pictures, motion_pictures, parking
 from diffdrive_jacobian.simulation import track_line
 
 HEADINGS = np.linspace(-np.pi, np.pi, 101)
@@ -96,7 +96,7 @@ def test_four_motions_leave_a_gap_that_is_the_bracket_to_second_order():
 
 
 def test_the_parking_robot_gets_sideways_without_ever_driving_sideways():
-    poses = parking_figure.parked()
+    poses = motion_pictures.parked()
     close(poses[0], [0.0, 0.4 * (1.0 - np.cos(1.2)), 0.0])
     close(poses[-1], 0.0)
     moved = np.diff(poses, axis=0)
@@ -105,7 +105,7 @@ def test_the_parking_robot_gets_sideways_without_ever_driving_sideways():
 
 
 def test_the_picture_of_parking_leaves_out_where_the_robot_stands_or_only_turns():
-    poses = parking_figure.parked()
+    poses = motion_pictures.parked()
     texts = [text.get_text() for text in parking(np.repeat(poses, 2, axis=0)).axes[0].texts]
     assert texts == [text.get_text() for text in parking().axes[0].texts]
     turned = poses[-1] + [[0.0, 0.0, 0.5], [0.0, 0.0, 1.0]]
@@ -124,13 +124,13 @@ def test_the_pseudo_inverse_of_s_stands_still_where_the_law_turns():
 
 @pytest.mark.slow
 def test_null_space_motion_leaves_the_tip_and_keeps_the_arm_away_from_an_obstacle():
-    arm = null_space_figure.ARM
-    track = null_space_figure.self_motion()
+    arm = arm_pictures.ARM
+    track = arm_pictures.self_motion()
     tips = arm.forward_kinematics(track)[:, :2]
     close(tips, np.broadcast_to(tips[0], tips.shape), 1e-4)
     assert np.ptp(track, axis=0).min() > 0.5
-    without, avoiding = (null_space_figure.tracked(avoid=avoid) for avoid in (False, True))
-    hit, kept = (arm.clearance(run.q, null_space_figure.OBSTACLE).min() for run in (without, avoiding))
+    without, avoiding = (arm_pictures.tracked(avoid=avoid) for avoid in (False, True))
+    hit, kept = (arm.clearance(run.q, arm_pictures.OBSTACLE).min() for run in (without, avoiding))
     assert hit < 0.02 < 0.15 < kept
     assert avoiding.error.max() < 1e-4
 

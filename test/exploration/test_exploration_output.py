@@ -16,7 +16,7 @@ from diffdrive_jacobian.exploration.output import remove_others, write_finding
 from diffdrive_jacobian.exploration.processes import _picklable
 from diffdrive_jacobian.faults import Hang, Loss
 from diffdrive_jacobian.plots import run_figure
-from diffdrive_jacobian.plots.fault_marks import VIOLATION
+from diffdrive_jacobian.plots.run_figure import VIOLATION
 from diffdrive_jacobian.properties import NeverFasterThan, Property, StaysNear, Watch
 from diffdrive_jacobian.testing import (
     ExplorationError,

@@ -13,11 +13,9 @@ from support.lockstep_nodes import QUICK, make_complete
 from support.ros_messages import twist
 
 from diffdrive_jacobian.bags import read_run
-from diffdrive_jacobian.bags.bag_reader import BagError
 from diffdrive_jacobian.drives import drive
-from diffdrive_jacobian.live.bag_player import BagPlayer
+from diffdrive_jacobian.live.bag_player import BagPlayer, RecordedRobot, read_robots
 from diffdrive_jacobian.live.commands import CancelGoal, Pause, Seek, SetSpeed, Step
-from diffdrive_jacobian.live.recorded_runs import read_robots
 from diffdrive_jacobian.live.session import Session
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.recording.recorder import Recorder
@@ -41,23 +39,25 @@ class Player:
 
     def __init__(self, bag, robots):
         self.session = Session()
-        self.page = self.session.enter()
         self.player = BagPlayer(self.session, bag, robots)
         self.player.advance(0.0)
 
     def send(self, *commands):
         for command in commands:
-            self.session.put(self.page, command)
-            self.player._obey(self.session.take_commands()[0][1])
+            self.player._obey(command)
         self.player.advance(0.0)
 
     @property
+    def snapshot(self):
+        return self.session.latest()[1]
+
+    @property
     def robot(self):
-        return self.session.latest()[1].robots[0]
+        return self.snapshot.robots[0]
 
     @property
     def world(self):
-        return self.session.latest()[1].world
+        return self.snapshot.world
 
 
 @pytest.fixture(scope='module')
@@ -96,6 +96,9 @@ def test_goals_and_the_chain_are_as_recorded(player):
     player.send(Seek(player.world['duration']))
     assert player.robot['goal']['index'] == 1
     assert player.robot['goal']['state'] == 'succeeded'
+    # It has no ground truth.
+    assert player.robot['truth'] is None
+    assert player.snapshot.true_trails['/'].points == []
 
 
 def test_time_plays_pauses_steps_and_jumps(player):
@@ -126,7 +129,7 @@ def test_what_was_recorded_cannot_be_steered(player):
 
 
 def test_curves_and_parameters_of_the_whole_bag(player):
-    fixed = player.session.latest()[1].fixed
+    fixed = player.snapshot.fixed
     strips = fixed['strips']['/']
     assert len({len(curve) for curve in strips.values()}) == 1
     assert strips['distance'][0] == pytest.approx(0.4, abs=0.05)
@@ -134,7 +137,7 @@ def test_curves_and_parameters_of_the_whole_bag(player):
     keys = {row['key']: row['value'] for row in fixed['settings']['/']}
     assert keys['controller/kp'] == QUICK['kp']
     assert fixed['bag'] == 'tour'
-    trail = player.session.latest()[1].trails['/']
+    trail = player.snapshot.trails['/']
     player.send(Seek(player.world['duration']))
     assert player.robot['travelled'] == len(trail.points)
 
@@ -143,9 +146,8 @@ def test_gains_of_another_package_are_shown_as_recorded(bag, robots):
     (robot,) = robots
     values = {**robot.run.of_node('go_to_goal'), 'controller': 'mine', 'k1': 2.5, 'Odd.name': 1.0}
     run = replace(robot.run, parameters={'/go_to_goal': {**values, 'k2': math.nan}})
-    player = Player(bag, [replace(robot, run=run)])
-    rows = player.session.latest()[1].fixed['settings']['/']
-    keys = {row['key']: row['value'] for row in rows}
+    player = Player(bag, [RecordedRobot('/', run, robot.start)])
+    keys = {row['key']: row['value'] for row in player.snapshot.fixed['settings']['/']}
     assert keys['controller/k1'] == 2.5
     assert not keys.keys() & {'controller/kp', 'controller/yaw_goal_tolerance', 'controller/k2'}
 
@@ -154,7 +156,9 @@ def test_the_page_follows_changes_of_the_controller(bag, robots):
     (robot,) = robots
     received = int(robot.run.odometry.received[20])
     change = (received, '/go_to_goal', {'use_goal_heading': True})
-    player = Player(bag, [replace(robot, run=replace(robot.run, parameter_events=(change,)))])
+    player = Player(
+        bag, [RecordedRobot('/', replace(robot.run, parameter_events=(change,)), robot.start)]
+    )
     for index, expected in ((19, False), (20, True), (19, False)):
         player.send(Seek(float(robot.time[index]) + 1e-6))
         assert player.robot['use_heading'] is expected
@@ -171,21 +175,16 @@ def test_several_robots(lockstep, tmp_path):
     recording.finish()
     player = Player(tmp_path / 'two', read_robots(tmp_path / 'two'))
     player.send(Seek(0.4))
-    one, two = player.session.latest()[1].robots
+    one, two = player.snapshot.robots
     assert (one['name'], two['name']) == ('/one', '/two')
     assert one['pose'][0] > 0.1
     assert two['pose'] == [0.0, 1.0, 0.0]
 
 
-def test_what_is_no_run(tmp_path):
-    with pytest.raises(BagError):
-        read_robots(tmp_path / 'none')
-
-
 @pytest.mark.process
 def test_a_bag_is_watched_without_ros():
     """In an interpreter of its own."""
-    program = 'import sys, diffdrive_jacobian.live.serving, diffdrive_jacobian.tools.watch_run\n'
+    program = 'import sys, diffdrive_jacobian.live.bag_player, diffdrive_jacobian.tools.watch_run\n'
     program += 'print(*{name.split(".")[0] for name in sys.modules})'
     run = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True)
     assert not set(run.stdout.split()) & {*ROS_MODULES, 'rpyutils', 'matplotlib'}
@@ -199,7 +198,7 @@ def test_the_ground_truth_of_a_bag(tmp_path):
     recording.finish()
     player = Player(tmp_path / 'slip', read_robots(tmp_path / 'slip'))
     run = read_run(tmp_path / 'slip')
-    trail = player.session.latest()[1].true_trails['/']
+    trail = player.snapshot.true_trails['/']
     assert len(trail.points) == len(run.ground_truth)
     for index in (10, len(run.odometry) - 1):
         player.send(Seek((run.odometry.stamps[index] - run.odometry.stamps[0]) * 1e-9 + 1e-6))
@@ -207,8 +206,3 @@ def test_the_ground_truth_of_a_bag(tmp_path):
         truth = run.ground_truth.values[latest, :3]
         assert player.robot['truth'] == pytest.approx(truth.tolist(), abs=1e-5)
         assert player.robot['truly_travelled'] == latest + 1
-
-
-def test_a_bag_without_ground_truth(player):
-    assert player.robot['truth'] is None
-    assert player.session.latest()[1].true_trails['/'].points == []

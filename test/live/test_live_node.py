@@ -10,6 +10,7 @@ from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from support.lockstep_nodes import QUICK, make_complete
 
 from diffdrive_jacobian.control.controller import KP, KV
@@ -41,7 +42,6 @@ class Live:
         self.session = Session()
         self.page = self.session.enter()
         self.node = world.add(LivePage(self.session, world.node.context, polled=False))
-        self.notices = []
 
     def send(self, *commands, page=None):
         for command in commands:
@@ -62,18 +62,20 @@ class Live:
             assert self.world.elapsed < end, (self.texts, self.robot())
             self.pass_time()
 
+    @property
+    def snapshot(self):
+        return self.session.latest()[1]
+
     def robot(self, name='/'):
         """Return what the page shows of a robot."""
-        _, snapshot = self.session.latest()
-        return next((one for one in snapshot.robots if one['name'] == name), None)
+        return next((one for one in self.snapshot.robots if one['name'] == name), None)
 
     @property
     def texts(self):
         return [notice['text'] for notice in self.session.notices_after(0)]
 
     def settings(self, name='/'):
-        _, snapshot = self.session.latest()
-        return {row['key']: row for row in snapshot.fixed['settings'][name]}
+        return {row['key']: row for row in self.snapshot.fixed['settings'][name]}
 
     def state(self, name='/'):
         return self.robot(name)['goal']['state']
@@ -124,8 +126,7 @@ def test_a_goal_is_driven_to_and_every_number_of_the_chain_is_there(driven):
     assert robot['distance'] <= 0.02
     assert robot['bearing_error'] is None
     assert robot['region']['a'] > robot['region']['b'] > 0.0
-    _, snapshot = driven.session.latest()
-    assert len(snapshot.trails['/'].points) > 10
+    assert len(driven.snapshot.trails['/'].points) > 10
 
 
 def test_waypoints_are_appended_and_the_ends_of_goals_are_reported(driven):
@@ -181,19 +182,17 @@ def test_driving_by_hand_cancels_the_goal_first_and_stops_with_the_page(driven):
     assert len(commands) == stopped
 
 
-def test_driving_by_hand_sends_25_commands_per_second_however_often_the_page_is_asked(driven):
+def test_a_goal_is_refused_while_the_robot_is_driven_by_hand(driven):
     commands = driven.world.listen(Twist, 'cmd_vel')
-    driven.send(DriveByHand('/', 0.25, 0.5))
+    driven.send(DriveByHand('/', 0.2, 0.0))
     begin = driven.world.elapsed
     while driven.world.elapsed < begin + 0.4:
         for _ in range(5):
             driven.node.work()
         driven.world.step(0.01)
+    # 25 per second, however often the page is asked.
     assert 8 <= len(commands) <= 11
-
-
-def test_a_goal_is_refused_while_the_robot_is_driven_by_hand(driven):
-    driven.send(DriveByHand('/', 0.2, 0.0), goal(1.0, 0.0))
+    driven.send(goal(1.0, 0.0))
     driven.pass_time(0.1)
     assert any('release the keys' in text for text in driven.texts)
     assert not driven.robot()['goal']['active']
@@ -215,7 +214,7 @@ def test_the_robot_is_placed_and_reset(driven):
     driven.until(lambda: driven.robot()['pose'] == pytest.approx([1.0, -2.0, 0.5]))
     driven.send(ClearPath('/'))
     driven.pass_time(0.1)
-    assert driven.session.latest()[1].trails['/'].points == [(1.0, -2.0)]
+    assert driven.snapshot.trails['/'].points == [(1.0, -2.0)]
     driven.send(Reset('/'))
     driven.until(lambda: driven.robot()['pose'] == [0.0, 0.0, 0.0])
 
@@ -246,6 +245,10 @@ def test_parameters_are_set_and_refusals_are_shown(driven):
     assert any(text.startswith('controller refused') for text in driven.texts)
     assert any('there is no setting' in text for text in driven.texts)
     assert driven.settings()['controller/kp']['value'] == 5.0
+    # What others change is followed.
+    controller = next(node for node in driven.world.nodes if isinstance(node, GoToGoal))
+    controller.set_parameters([Parameter('kv', value=1.25)])
+    driven.until(lambda: driven.settings()['controller/kv']['value'] == 1.25, timeout=2.0)
 
 
 class Driver(Node):
@@ -291,14 +294,6 @@ def test_the_nodes_of_this_package_have_all_sliders_with_the_usual_ranges(driven
     ranges = {key: (row['low'], row['high']) for key, row in driven.settings().items()}
     usual = {one.key: (one.low, one.high) for one in settings.offered((KP, KV))}
     assert ranges == usual
-
-
-def test_changes_of_others_are_followed(driven):
-    controller = next(node for node in driven.world.nodes if isinstance(node, GoToGoal))
-    from rclpy.parameter import Parameter
-
-    controller.set_parameters([Parameter('kv', value=1.25)])
-    driven.until(lambda: driven.settings()['controller/kv']['value'] == 1.25, timeout=2.0)
 
 
 def test_robots_in_namespaces(live):
@@ -354,14 +349,6 @@ def test_without_a_page_nothing_is_computed(live):
     assert live.session.latest()[0] == 0
 
 
-def test_robots_that_are_silent_and_gone(live, monkeypatch):
-    robot = live.world.add(make_complete(VirtualRobot))
-    live.until(lambda: live.robot())
-    live.world.remove(robot)
-    monkeypatch.setattr(live_node, 'LOST', 0.0)
-    live.until(lambda: live.robot() is None)
-
-
 def test_a_node_that_changes_its_name_leaves_nothing_behind(driven):
     robot = driven.node.robots['/']
     before = len(list(driven.node.clients))
@@ -376,20 +363,20 @@ def test_a_node_that_changes_its_name_leaves_nothing_behind(driven):
     assert not list(driven.node.clients)
 
 
-def test_a_robot_too_many_is_named(live, monkeypatch):
+def test_a_robot_too_many_is_named_until_another_one_is_silent_and_gone(live, monkeypatch):
     monkeypatch.setattr(live_node, 'MAX_ROBOTS', 1)
     first = live.world.add(make_complete(VirtualRobot, '/one'))
     live.until(lambda: live.robot('/one'))
     live.world.add(make_complete(VirtualRobot, '/two'))
 
     def notes():
-        return live.session.latest()[1].fixed['notes']
+        return live.snapshot.fixed['notes']
 
     live.until(notes)
     assert notes() == ['at most 1 robots are shown; 1 more publish odometry: /two']
     live.world.remove(first)
     monkeypatch.setattr(live_node, 'LOST', 0.0)
-    live.until(lambda: live.robot('/two') and not notes())
+    live.until(lambda: live.robot('/two') and not live.robot('/one') and not notes())
 
 
 def test_a_robot_that_slips_is_shown_where_it_truly_is(live):
@@ -411,12 +398,12 @@ def test_a_robot_that_slips_is_shown_where_it_truly_is(live):
     assert live.robot()['truth'] == pytest.approx(robot.truth.tolist(), abs=1e-4)
     (end,) = ends
     assert end.distance <= 0.021 < end.true_distance
-    trail = live.session.latest()[1].true_trails['/']
+    trail = live.snapshot.true_trails['/']
     assert len(trail.points) > 10
     assert trail.points[-1] == pytest.approx(robot.truth[:2].tolist(), abs=0.011)
     live.send(ClearPath('/'))
     live.pass_time(0.02)
-    assert len(live.session.latest()[1].true_trails['/'].points) <= 1
+    assert len(live.snapshot.true_trails['/'].points) <= 1
 
 
 def test_the_heading_of_a_goal_is_shown_where_it_counts(driven):

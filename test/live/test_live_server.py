@@ -32,7 +32,6 @@ DRIVE = json.dumps({'do': 'drive', 'robot': '/', 'v': 0.2, 'omega': 0.0})
 @pytest.fixture
 def server():
     made = LiveServer(Session())
-    made.start()
     yield made
     made.close()
     assert not made._thread.is_alive()
@@ -303,7 +302,6 @@ def test_a_page_that_does_not_read_delays_nobody(server):
 
 def test_it_ends_while_pages_are_open():
     server = LiveServer(Session())
-    server.start()
     with page(server) as open_page:
         server.close()
         assert not server._thread.is_alive()
@@ -312,5 +310,5 @@ def test_it_ends_while_pages_are_open():
         socket.create_connection(('127.0.0.1', server.port), timeout=5)
 
 
-def test_it_can_be_closed_before_it_started():
+def test_it_can_be_closed_at_once():
     LiveServer(Session()).close()

@@ -7,6 +7,7 @@ import re
 import signal
 import socket
 import sys
+from types import SimpleNamespace
 
 import pytest
 from chromium import until
@@ -126,22 +127,17 @@ def test_a_port_in_use_a_bag_that_is_none_and_a_missing_library(capsys, tmp_path
     assert "pip install 'diffdrive_jacobian[live]'" in capsys.readouterr().err
 
 
-class Options:
-    no_browser = False
-
-
-class Server:
-    url, opening_url = 'http://127.0.0.1:1/secret/', 'http://127.0.0.1:1/open/once'
-
-
 def test_the_browser_is_started_without_the_secret_and_only_on_a_display(capsys, monkeypatch):
-    opened_urls = []
+    options, opened_urls = SimpleNamespace(no_browser=False), []
+    server = SimpleNamespace(
+        url='http://127.0.0.1:1/secret/', opening_url='http://127.0.0.1:1/open/once'
+    )
     monkeypatch.setattr(_page.webbrowser, 'open', opened_urls.append)
     for name in _page.DISPLAYS:
         monkeypatch.delenv(name, raising=False)
-    _page.announcing(Options())(Server())
+    _page.announcing(options)(server)
     assert opened_urls == []
     assert 'page: http://127.0.0.1:1/secret/' in capsys.readouterr().out
     monkeypatch.setenv('DISPLAY', ':0')
-    _page.announcing(Options())(Server())
+    _page.announcing(options)(server)
     until(lambda: opened_urls == ['http://127.0.0.1:1/open/once'], 'the browser is started')

@@ -17,8 +17,8 @@ import nav_msgs.msg  # noqa: F401
 import rosidl_generator_py  # noqa: F401
 
 import diffdrive_jacobian.nodes.go_to_goal
-import diffdrive_jacobian.testing.golden_run
-import diffdrive_jacobian.testing.robot_at  # noqa: F401
+import diffdrive_jacobian.nodes.virtual_robot
+import diffdrive_jacobian.testing.recorded_run  # noqa: F401
 
 SETTING = """
     import pytest

@@ -37,5 +37,3 @@ export class Connection {
     return true;
   }
 }
-
-

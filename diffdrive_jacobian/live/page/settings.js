@@ -17,6 +17,7 @@ export class Settings {
     this.send = send;
     this.rows = new Map();
     this.shown = '';
+    /** When each was sent last. */
     this.sent = new Map();
   }
 
@@ -32,7 +33,7 @@ export class Settings {
       byId('sliders').replaceChildren(...this.grouped(rows));
     }
     for (const row of rows) {
-      const changed = this.sent.get(row.key)?.time ?? -Infinity;
+      const changed = this.sent.get(row.key) ?? -Infinity;
       if (force || performance.now() - changed > REST) this.rows.get(row.key)(row.value);
     }
   }
@@ -101,9 +102,9 @@ export class Settings {
 
   /** Send a value; of many in a row not every one. */
   change(row, value, moving = false) {
-    const now = performance.now(), before = this.sent.get(row.key)?.time ?? -Infinity;
+    const now = performance.now(), before = this.sent.get(row.key) ?? -Infinity;
     if (moving && now - before < PERIOD) return;
-    this.sent.set(row.key, { time: now });
+    this.sent.set(row.key, now);
     this.send({ do: 'set', robot: this.model.selected.name, parameter: row.key, value });
   }
 
@@ -113,5 +114,3 @@ export class Settings {
     this.show(true);
   }
 }
-
-

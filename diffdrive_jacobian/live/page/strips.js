@@ -6,7 +6,7 @@ const STRIPS = [
   { name: 'v', unit: 'm/s', curves: [['command_v', 'muted', 'set', true], ['v', 'v', 'v']] },
   { name: 'ω', unit: 'rad/s', curves: [['command_omega', 'muted', 'set', true], ['omega', 'omega', 'ω']] },
   { name: 'wheels', unit: 'rad/s', digits: 1, curves: [['left', 'left', 'L'], ['right', 'right', 'R']] },
-  { name: 'distance', unit: 'm', curves: [['distance', 'v', 'd']], zero: true, ofPath: false },
+  { name: 'distance', unit: 'm', curves: [['distance', 'v', 'd']], ofPath: false },
   { name: 'bearing error', unit: 'rad', curves: [['goal_heading_error', 'muted', 'Δθ', true], ['bearing_error', 'omega', 'e']], ofPath: false },
   { name: 'across path', unit: 'm', digits: 3, curves: [['across', 'v', 'left']], ofPath: true },
   { name: 'heading to path', unit: 'rad', curves: [['path_heading_error', 'omega', 'Δθ']], ofPath: true },
@@ -21,12 +21,13 @@ export class Strips {
     this.strips = STRIPS.map((strip) => {
       const canvas = element('canvas', { role: 'img', 'aria-label': `${strip.name} over time` });
       const values = strip.curves.map(([, color]) => element('span', { class: color === 'muted' ? 'unit' : color }));
-      const node = element('div', { class: 'strip' },
+      // Without a path, as at the start: the map must not change its size after it is shown.
+      const node = element('div', { class: 'strip', hidden: strip.ofPath === true },
         element('p', {}, element('span', { class: 'name' }, strip.name, ' ', element('span', { class: 'unit' }, strip.unit)), ...values), canvas);
       section.append(node);
       canvas.addEventListener('pointerdown', (event) => this.seek(event, canvas, onSeek));
       canvas.addEventListener('pointermove', (event) => { if (event.buttons) this.seek(event, canvas, onSeek); });
-      return { ...strip, node, canvas, values, span: 0 };
+      return { ...strip, node, canvas, values };
     });
   }
 
