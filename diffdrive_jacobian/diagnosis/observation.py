@@ -19,7 +19,7 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
-from diffdrive_jacobian.diagnosis.description import (
+from diffdrive_jacobian.diagnosis.graph import (
     ClockMessages,
     Endpoint,
     Graph,

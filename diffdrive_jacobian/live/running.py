@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 
 from diffdrive_jacobian.control import Path
-from diffdrive_jacobian.drives import in_lockstep, in_real_time
-from diffdrive_jacobian.drives.driving import overrides, recorder_of
+from diffdrive_jacobian.drives import in_lockstep, in_real_time, overrides, recorder_of
 from diffdrive_jacobian.live.goal_progress import GoalEnd
 from diffdrive_jacobian.live.node import LivePage
 from diffdrive_jacobian.live.pacing import Pacing

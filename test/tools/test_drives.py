@@ -10,8 +10,14 @@ import pytest
 from rclpy.parameter import Parameter
 
 from diffdrive_jacobian.bags import read_run
-from diffdrive_jacobian.drives import DriveError, Outcome, drive, waypoints_through
-from diffdrive_jacobian.drives.driving import in_lockstep, in_real_time
+from diffdrive_jacobian.drives import (
+    DriveError,
+    Outcome,
+    drive,
+    in_lockstep,
+    in_real_time,
+    waypoints_through,
+)
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.remote_goal import Result, send_goal

@@ -15,8 +15,7 @@ from rclpy.qos import (
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from diffdrive_jacobian.diagnosis.description import Quality
-from diffdrive_jacobian.diagnosis.graph import mismatch
+from diffdrive_jacobian.diagnosis.graph import Quality, mismatch
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep.external.expectations import Due
 from diffdrive_jacobian.lockstep.external.waiting import Probe

@@ -45,6 +45,16 @@ from diffdrive_jacobian.time_units import nanoseconds
 if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep.runner import LockstepRunner
 
+__all__ = [
+    'DriveError',
+    'DriveProgress',
+    'Outcome',
+    'drive',
+    'in_lockstep',
+    'in_real_time',
+    'waypoints_through',
+]
+
 NAME = 'drive_to'
 """Name of the node that sends the goals."""
 
