@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from support.commands import refused
 
-from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools import _cli
 
 AFTER = 'ROS arguments come after --ros-args'
 WRONG = {
@@ -183,19 +183,19 @@ def test_arguments_of_tool_and_ros_are_separated(arguments, own, ros):
 
 def test_headings_are_in_radians_or_degrees():
     parser = _cli.Parser(prog='x')
-    _options.add_heading(parser, 'heading')
+    parser.add_heading('heading')
     for arguments, expected in (
         ([], None),
         (['--heading', '-6.2'], -6.2),
         (['--heading', '90', '--degrees'], math.pi / 2),
         (['--degrees', '--heading', ' -360'], -math.tau),
     ):
-        assert _options.given_heading(parser, parser.parse_args(arguments)) == expected
+        assert parser.given_heading(parser.parse_args(arguments)) == expected
 
 
 def test_robot_stands_for_its_parameter_file():
     parser = _cli.Parser(prog='x')
-    _options.add_params_file(parser)
+    parser.add_params_file()
     options = parser.parse_args(['--robot', 'turtlebot3_burger'])
     expected = Path(__file__).parents[2] / 'config' / 'turtlebot3_burger.yaml'
     assert Path(options.params_file).read_text() == expected.read_text()
@@ -204,15 +204,15 @@ def test_robot_stands_for_its_parameter_file():
 
 def test_namespaces():
     for text, expected in (('robot1', '/robot1'), ('/a/b/', '/a/b'), ('/', '/'), ('', '/')):
-        assert _options.namespace(text) == expected
+        assert _cli.namespace(text) == expected
     for text in ('a b', '1a', 'a//b', 'a-b'):
         with pytest.raises(argparse.ArgumentTypeError):
-            _options.namespace(text)
+            _cli.namespace(text)
 
 
 def test_a_bag_is_not_named_like_a_file():
     for name in ('run.png', 'run.svg/', 'a/run.PDF', 'run.csv', 'run.txt', 'run.yaml'):
         with pytest.raises(argparse.ArgumentTypeError):
-            _options.bag_folder(name)
+            _cli.bag_folder(name)
     for name in ('run', 'run.2', 'runs.png/run', 'run_2026_01_01-10_00_00', '.png'):
-        assert _options.bag_folder(name) == name
+        assert _cli.bag_folder(name) == name

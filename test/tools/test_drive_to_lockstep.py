@@ -22,7 +22,7 @@ from diffdrive_jacobian.lockstep import runner as testing_runner
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.parameters.nodes import CONTROLLERS
 from diffdrive_jacobian.testing import Lockstep
-from diffdrive_jacobian.tools import _progress
+from diffdrive_jacobian.tools import _output
 
 QUICK = ('--ros-args', '-p', 'kp:=12.0', '-p', 'kv:=3.0')
 RECORD = ('--no-plot', '-o', 'bag')
@@ -164,7 +164,7 @@ def test_a_stuck_callback_fails_and_the_recording_is_kept(tmp_path, monkeypatch)
 
 
 def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
-    monkeypatch.setattr(_progress.GoalBar, 'show', lambda *_: 1 / 0)
+    monkeypatch.setattr(_output.GoalBar, 'show_goal', lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         commands.run('drive_to', 1, 1, '--lockstep', *RECORD)
     assert (tmp_path / 'bag').is_dir()

@@ -32,7 +32,7 @@ from diffdrive_jacobian.recording.record import open_recording
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep
-from diffdrive_jacobian.tools import _messages, plot_run
+from diffdrive_jacobian.tools import _output, plot_run
 
 CONFIGS = Path(__file__).parents[2] / 'config'
 
@@ -228,14 +228,14 @@ def test_force_replaces_bags_and_files_and_no_directories(tmp_path, robots, monk
 
 
 def test_numbers_agree_with_their_nouns():
-    counted = [_messages.counted(number, 'topic') for number in (0, 1, 2)]
+    counted = [_output.counted(number, 'topic') for number in (0, 1, 2)]
     assert counted == ['0 topics', '1 topic', '2 topics']
 
 
 def test_what_is_waited_for_is_said_after_half_a_second_of_each_wait(monkeypatch, capsys):
     now = 100.0
-    monkeypatch.setattr(_messages.time, 'monotonic', lambda: now)
-    waiting = _messages.Waiting()
+    monkeypatch.setattr(_output.time, 'monotonic', lambda: now)
+    waiting = _output.Waiting()
     said = []
     for step in range(100):
         now = 100.0 + 0.1 * step
@@ -260,12 +260,12 @@ def test_long_work_is_named_on_a_terminal(monkeypatch, capsys):
             self.written.set()
 
     terminal = Terminal()
-    monkeypatch.setattr(_messages, 'FIRST', 0.01)
-    with _messages.busy('tool', 'reading'):
+    monkeypatch.setattr(_output, 'FIRST', 0.01)
+    with _output.busy('tool', 'reading'):
         pass
     assert capsys.readouterr().err == ''
-    monkeypatch.setattr(_messages.sys, 'stderr', terminal)
-    with _messages.busy('tool', 'reading'):
+    monkeypatch.setattr(_output.sys, 'stderr', terminal)
+    with _output.busy('tool', 'reading'):
         assert terminal.written.wait(10.0)
     assert terminal.getvalue() == 'tool: reading ...\n'
 
