@@ -160,10 +160,6 @@ class DriveProgress(Protocol):
         """
 
 
-class _Silent(DriveProgress):
-    """A progress that is not shown."""
-
-
 def waypoints_through(places: ArrayLike, heading: float = 0.0) -> NDArray[np.float64]:
     """Return waypoints with a heading at each place.
 
@@ -236,7 +232,7 @@ def drive(
         goals = np.asarray(goals, dtype=np.float64)
         if goals.ndim != 2 or goals.shape[1] != 3:
             goals = waypoints_through(goals)
-    sent, signals, progress = goals, signals or Signals(), progress or _Silent()
+    sent, signals = goals, signals or Signals()
     with ExitStack() as stack:
         if runner is None:
             runner = stack.enter_context(
@@ -263,14 +259,15 @@ def drive(
         received = ignoring_invalid(JOINT_STATE, JointState, on_joint_states)
         client.create_subscription(JointState, 'joint_states', received, 10, raw=True)
         nodes = (robot, bridge, controller, client)
-        progress.nodes_created([node.get_fully_qualified_name() for node in nodes])
+        if progress is not None:
+            progress.nodes_created([node.get_fully_qualified_name() for node in nodes])
         discover = recorder_of(runner, recording)
         client.send_on_odometry()
         started = runner.seconds()
 
         def ended() -> bool:
             discover()
-            if client.robot is not None and not client.ended:
+            if progress is not None and client.robot is not None and not client.ended:
                 index = controller.waypoint
                 if index is not None:
                     # A goal of another process may have more poses.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +14,16 @@ from diffdrive_jacobian.text import listed
 
 INFINITE = 2**63 - 1
 """Duration that means no limit (ns)."""
+INFINITE_FROM = 2**62
+"""Durations from here on mean no limit, too (ns): implementations of DDS round the largest one."""
+COMMANDS = ('cmd_vel', 'joint_command')
+"""Topics that must have a subscription."""
+MAX_AGE = 1.0
+"""Largest age of a message on receipt (s)."""
+MAX_AHEAD = 0.1
+"""Largest time by which a stamp may lie in the future (s)."""
+PATIENCE = 1.0
+"""Shortest observation after which a silent /clock is reported (s)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,43 +134,27 @@ class Graph:
         return [one for one in self.endpoints if one.topic == topic and not one.publishes]
 
 
-_UNKNOWN = Topic(name='')
-COMMANDS = ('cmd_vel', 'joint_command')
-"""Topics that must have a subscription."""
-
-
-def _known(topic: str) -> Topic:
-    """Return what is known of a topic of this name, in any namespace."""
-    return TOPICS.get(base_name(topic), _UNKNOWN)
-
-
 def check_topics(graph: Graph) -> Iterator[Problem]:
     """Yield what keeps nodes from communicating."""
-    yield from _check_names(graph)
-    for topic in graph.topics():
-        yield from _check_types(graph, topic)
-        yield from _check_quality(graph, topic)
-        yield from _check_ends(graph, topic)
-
-
-def _check_names(graph: Graph) -> Iterator[Problem]:
-    names = Counter(node.name for node in graph.nodes)
-    for name, count in sorted(names.items()):
+    for name, count in sorted(Counter(node.name for node in graph.nodes).items()):
         if count > 1:
             yield Problem(
                 f'{count} nodes have the name {name}',
                 'stop one of them, or give each a name or a namespace of its own (-r __node:=NAME, '
                 '-r __ns:=/NAME); one that was killed disappears within 20 s',
             )
+    for topic in graph.topics():
+        yield from _check_types(graph, topic)
+        yield from _check_quality(graph, topic)
+        yield from _check_ends(graph, topic)
 
 
 def _check_types(graph: Graph, topic: str) -> Iterator[Problem]:
-    publishers: dict[str, list[str]] = {}
-    subscriptions: dict[str, list[str]] = {}
-    for one in graph.publishers(topic):
-        publishers.setdefault(one.kind, []).append(one.node)
-    for one in graph.subscriptions(topic):
-        subscriptions.setdefault(one.kind, []).append(one.node)
+    publishers: dict[str, list[str]] = defaultdict(list)
+    subscriptions: dict[str, list[str]] = defaultdict(list)
+    for one in graph.endpoints:
+        if one.topic == topic:
+            (publishers if one.publishes else subscriptions)[one.kind].append(one.node)
     for theirs, sources in sorted(publishers.items()):
         for ours, sinks in sorted(subscriptions.items()):
             if theirs != ours:
@@ -209,10 +203,6 @@ def _duration(nanoseconds: int) -> str:
     return 'no limit' if nanoseconds >= INFINITE_FROM else f'{nanoseconds / 1e9:g} s'
 
 
-INFINITE_FROM = 2**62
-"""Durations from here on mean no limit (ns): implementations of DDS round the largest one."""
-
-
 def _check_quality(graph: Graph, topic: str) -> Iterator[Problem]:
     for subscription in graph.subscriptions(topic):
         publishers = [one for one in graph.publishers(topic) if one.kind == subscription.kind]
@@ -220,23 +210,21 @@ def _check_quality(graph: Graph, topic: str) -> Iterator[Problem]:
         for publisher in bad:
             reasons = mismatch(publisher.quality, subscription.quality)
             rest = ' It receives the other publishers.' if len(bad) < len(publishers) else ''
+            policy = {
+                'reliability': 'reliability:=best_effort',
+                'durability': 'durability:=volatile',
+            }.get(reasons[0].split(':')[0], 'POLICY:=VALUE')
             yield Problem(
                 f'{subscription.node} receives nothing of {publisher.node} on {topic}, because their '
                 f'quality of service does not match ({"; ".join(reasons)}).{rest}',
                 f'change one of both; for nodes of this package as in -p '
-                f'qos_overrides.{topic}.subscription.{_changed_policy(reasons[0])}',
+                f'qos_overrides.{topic}.subscription.{policy}',
             )
 
 
-def _changed_policy(reason: str) -> str:
-    return {
-        'reliability': 'reliability:=best_effort',
-        'durability': 'durability:=volatile',
-    }.get(reason.split(':')[0], 'POLICY:=VALUE')
-
-
 def _check_ends(graph: Graph, topic: str) -> Iterator[Problem]:
-    known, publishers = _known(topic), [one.node for one in graph.publishers(topic)]
+    known = TOPICS.get(base_name(topic), Topic(name=''))
+    publishers = [one.node for one in graph.publishers(topic)]
     # A node that listens to what it publishes itself, as go_to_goal may, does not act on it.
     subscriptions = [one.node for one in graph.subscriptions(topic) if one.node not in publishers]
     for fault in (SEVERAL, ALTERNATING, UNREAD, UNPUBLISHED):
@@ -253,23 +241,11 @@ def _check_ends(graph: Graph, topic: str) -> Iterator[Problem]:
 
 def _namesake(graph: Graph, topic: str, *, publishes: bool) -> str:
     """Return a hint to a topic of the same base name that has the missing end."""
-    others: list[Endpoint] = [
-        one
-        for one in graph.endpoints
-        if one.publishes == publishes and one.topic != topic and base_name(one.topic) == base_name(topic)
-    ]
-    if not others:
-        return ''
-    verb = 'publishes' if publishes else 'subscribes to'
-    return f'; {others[0].node} {verb} {others[0].topic}'
-
-
-MAX_AGE = 1.0
-"""Largest age of a message on receipt (s)."""
-MAX_AHEAD = 0.1
-"""Largest time by which a stamp may lie in the future (s)."""
-PATIENCE = 1.0
-"""Shortest observation after which a silent /clock is reported (s)."""
+    for one in graph.endpoints:
+        same = one.topic != topic and base_name(one.topic) == base_name(topic)
+        if same and one.publishes == publishes:
+            return f'; {one.node} {"publishes" if publishes else "subscribes to"} {one.topic}'
+    return ''
 
 
 def check_clocks(graph: Graph) -> Iterator[Problem]:
