@@ -373,13 +373,14 @@ def test_headings_are_in_radians_or_degrees():
         assert parser.given_heading(parser.parse_args(arguments)) == expected
 
 
-def test_robot_stands_for_its_parameter_file():
+def test_robots_stand_for_their_parameter_files():
     parser = _cli.Parser(prog='x')
     parser.add_params_file()
-    options = parser.parse_args(['--robot', 'turtlebot3_burger'])
-    expected = Path(__file__).parents[2] / 'config' / 'turtlebot3_burger.yaml'
-    assert Path(options.params_file).read_text() == expected.read_text()
-    assert 'create3, turtlebot3_burger' in ' '.join(parser.format_help().split())
+    files = sorted((Path(__file__).parents[2] / 'config').glob('*.yaml'))
+    names = [file.stem for file in files]
+    found = [Path(parser.parse_args(['--robot', name]).params_file).read_text() for name in names]
+    assert found == [file.read_text() for file in files]
+    assert f'of a robot: {", ".join(names)}' in ' '.join(parser.format_help().split())
 
 
 def test_namespaces():

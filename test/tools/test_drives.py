@@ -10,6 +10,7 @@ import signal
 import threading
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -56,30 +57,18 @@ def elsewhere(tmp_path, monkeypatch):
 # --- From Python
 
 
-class Progress:
-    """Keeps what it receives."""
-
-    def __init__(self):
-        self.names = []
-        self.states = []
-
-    def nodes_created(self, names):
-        self.names += names
-
-    def driving(self, *state):
-        self.states.append(state)
-
-
 def test_a_drive_from_python_returns_the_outcome():
-    progress = Progress()
+    progress = Mock()
     outcome = drive([[0.5, 0.0], [0.5, 0.5]], lockstep=True, parameters=QUICK, progress=progress)
     assert isinstance(outcome, Outcome)
     assert outcome.arrived
     assert not outcome.interrupted
     assert outcome.distance <= 0.02
     assert math.dist(outcome.pose[:2], (0.5, 0.5)) == pytest.approx(outcome.distance)
-    assert progress.names == ['/virtual_robot', '/wheel_bridge', '/go_to_goal', '/drive_to']
-    seconds, indices, distances, _ = zip(*progress.states, strict=True)
+    names = ['/virtual_robot', '/wheel_bridge', '/go_to_goal', '/drive_to']
+    progress.nodes_created.assert_called_once_with(names)
+    states = [call.args for call in progress.driving.call_args_list]
+    seconds, indices, distances, _ = zip(*states, strict=True)
     assert list(seconds) == sorted(seconds)
     assert sorted(set(indices)) == [0, 1]
     assert distances[0] == pytest.approx(0.5)
@@ -159,18 +148,14 @@ def test_goals_are_sent_one_after_the_other_in_one_runner():
 
 
 def test_an_error_of_the_progress_cancels_the_goal():
-    class Broken(Progress):
-        def waiting(self, reason):
-            pass
-
-        def driving(self, *state):
-            raise BrokenPipeError
-
+    progress = Mock(**{'driving.side_effect': BrokenPipeError})
     with in_lockstep() as runner:
         robot = runner.add(lambda: VirtualRobot(context=runner.context))
         controller = runner.add(lambda: GoToGoal(context=runner.context))
         with pytest.raises(BrokenPipeError):
-            send_goal([5.0, 0.0, 0.0], runner=runner, progress=Broken())
+            send_goal(
+                [5.0, 0.0, 0.0], runner=runner, progress=Mock(**{'driving.side_effect': BrokenPipeError})
+            )
         assert controller.waypoint is None
         assert robot.get_publishers_info_by_topic('/goal_pose') == []
 
