@@ -6,7 +6,7 @@ import argparse
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -273,11 +273,6 @@ class Parser(argparse.ArgumentParser):
         """Add the option for the longest duration of what a tool does (s)."""
         self.add_value('--timeout', 'SECONDS', text, default=default)
 
-    def add_controller(self, names: Iterable[str], text: str, default: object = None) -> None:
-        """Add the option for a controller, with `%(choices)s` in the help for their names."""
-        described = text if default is None else f'{text} (default: %(default)s)'
-        self.add_argument('--controller', choices=names, metavar='NAME', default=default, help=described)
-
     def add_path(self, name: str, what: str = '') -> None:
         """Add the argument or the option for a path, which `given_path` reads."""
         text = 'circle:RADIUS, line:LENGTH or eight:SIZE (m), or a .csv or .yaml file of poses'
@@ -350,10 +345,6 @@ class Parser(argparse.ArgumentParser):
     def add_force(self, what: str) -> None:
         """Add the option to overwrite what is named."""
         self.add_argument('--force', action='store_true', help=f'overwrite {what} (default: refuse)')
-
-    def add_no_plot(self, text: str) -> None:
-        """Add the option to draw no picture."""
-        self.add_argument('--no-plot', action='store_true', help=text)
 
     def add_storage(self, default: str | None = None) -> None:
         """Add the option for the file format of a bag to write. None: that of the bag that is read."""

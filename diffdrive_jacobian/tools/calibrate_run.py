@@ -31,6 +31,8 @@ PROGRAM = 'calibrate_run'
 ENDINGS = ('yaml', 'yml')
 RADIUS_BOUNDS, SEPARATION_BOUNDS = (1e-3, 10.0), (1e-3, 100.0)
 """Nominal dimensions that the nodes accept (m)."""
+GIVEN = ('yaw_offset', 'time_offset', 'wheel_noise', 'position_noise', 'heading_noise')
+"""Options that are fields of `Given`."""
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
@@ -57,8 +59,10 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         return _output.interrupted(PROGRAM, 'nothing was written')
     except (BagError, UserError, ValueError, OSError) as error:
         return _output.complain(PROGRAM, error)
+    lever_arm = None if options.lever_arm is None else tuple(options.lever_arm)
+    given = Given(lever_arm=lever_arm, **{name: getattr(options, name) for name in GIVEN})
     try:
-        result = calibrate([one.recording for one in read], nominal, _given(options))
+        result = calibrate([one.recording for one in read], nominal, given)
     except CalibrationError as error:
         return _output.complain(PROGRAM, error, FAILED)
     for note in result.notes:
@@ -169,17 +173,6 @@ def _nominal(options: argparse.Namespace, read: Sequence[WheelsAndReference]) ->
     return Geometry(wheel_radius=radius, wheel_separation=separation)
 
 
-def _given(options: argparse.Namespace) -> Given:
-    return Given(
-        lever_arm=None if options.lever_arm is None else tuple(options.lever_arm),
-        yaw_offset=options.yaw_offset,
-        time_offset=options.time_offset,
-        wheel_noise=options.wheel_noise,
-        position_noise=options.position_noise,
-        heading_noise=options.heading_noise,
-    )
-
-
 _noise = _cli.number_that(between(1e-12, 1e3))
 """Parses a noise that squares and inverses of floats can represent."""
 
@@ -200,7 +193,7 @@ def _parser() -> _cli.Parser:
         'parameter file to write, .yaml; the picture is FILE.png (default: BAG_calibration.yaml '
         'beside the first bag)',
     )
-    parser.add_no_plot('do not draw')
+    parser.add_argument('--no-plot', action='store_true', help='do not draw')
     parser.add_force('the parameter file and the picture')
     parser.add_argument(
         '--reference',

@@ -310,9 +310,11 @@ def _parser() -> _cli.Parser:
         kind=_cli.tolerance,
     )
     parser.add_heading('heading at the last goal (rad) (default: any)')
-    parser.add_controller(
-        CONTROLLERS,
-        'controller: %(choices)s (default: go_to_goal, unless a file names another)',
+    parser.add_argument(
+        '--controller',
+        choices=CONTROLLERS,
+        metavar='NAME',
+        help='controller: %(choices)s (default: go_to_goal, unless a file names another)',
     )
     parser.add_path('--path', 'drive along a path: ')
     parser.add_value(
@@ -335,7 +337,7 @@ def _parser() -> _cli.Parser:
     )
     parser.add_force('BAG and BAG.png, at the end of the drive')
     parser.add_argument('--no-record', action='store_true', help='neither record nor draw')
-    parser.add_no_plot('record, but do not draw')
+    parser.add_argument('--no-plot', action='store_true', help='record, but do not draw')
     parser.add_argument(
         '--lockstep',
         action='store_true',

@@ -190,8 +190,13 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
     parser.add_value('--starts', 'N', text, default=usual.starts, kind=_cli.integer_from(1, MAX_LOOPS))
     text = 'distance of the start poses from the goal (m)'
     parser.add_value('--distance', 'M', text, default=usual.distance)
-    text = 'controller, whose gains are options, too: %(choices)s'
-    parser.add_controller(CONTROLLERS, text, default=usual.controller)
+    parser.add_argument(
+        '--controller',
+        choices=CONTROLLERS,
+        metavar='NAME',
+        default=usual.controller,
+        help='controller, whose gains are options, too: %(choices)s (default: %(default)s)',
+    )
     parser.add_value('--rate', 'HZ', 'control rate (Hz)', default=usual.rate)
     text = 'longest duration of a closed loop (s)'
     parser.add_value('--duration', 'S', text, default=usual.duration)

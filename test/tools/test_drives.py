@@ -153,9 +153,7 @@ def test_an_error_of_the_progress_cancels_the_goal():
         robot = runner.add(lambda: VirtualRobot(context=runner.context))
         controller = runner.add(lambda: GoToGoal(context=runner.context))
         with pytest.raises(BrokenPipeError):
-            send_goal(
-                [5.0, 0.0, 0.0], runner=runner, progress=Mock(**{'driving.side_effect': BrokenPipeError})
-            )
+            send_goal([5.0, 0.0, 0.0], runner=runner, progress=progress)
         assert controller.waypoint is None
         assert robot.get_publishers_info_by_topic('/goal_pose') == []
 
