@@ -318,12 +318,9 @@ def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
 
 @pytest.mark.process
 def test_ends_on_a_signal(tmp_path):
-    signals = (signal.SIGINT, signal.SIGTERM)
     with open_world(tmp_path) as world:
-        children = [world.start('drive_to', '--lockstep', *map(str, CRAWL)) for _ in signals]
-        for child, number in zip(children, signals, strict=True):
-            child.until_says('m to go')
-            child.signal(number)
-        for child in children:
-            assert child.exit() == 130
-            assert child.last_line.startswith('interrupted: the robot stopped at x ')
+        child = world.start('drive_to', '--lockstep', *map(str, CRAWL))
+        child.until_says('m to go')
+        child.signal(signal.SIGINT)
+        assert child.exit() == 130
+        assert child.last_line.startswith('interrupted: the robot stopped at x ')

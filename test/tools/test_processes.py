@@ -97,7 +97,7 @@ def test_each_goal_has_its_own_end_whatever_became_of_older_ones(world):
         )
 
 
-def test_no_wait_leaves_the_goal_and_timeout_cancels_it(world):
+def test_no_wait_leaves_the_goal_and_timeout_and_ctrl_c_cancel_it(world):
     drive = Drive(world)
     left = world.start('send_goal', *FAR, '--no-wait')
     drive.harness.until(drive.drives, 'the robot drives')
@@ -108,10 +108,6 @@ def test_no_wait_leaves_the_goal_and_timeout_cancels_it(world):
     assert lines[-1] == 'canceled: the robot was stopped'
     drive.until_canceled()
     assert (left.exit(), left.last_line) == (0, 'sent: goal (50, 0) on /goal_pose')
-
-
-def test_ctrl_c_cancels_the_goal(world):
-    drive = Drive(world)
     sender = drive.send(*FAR)
     sender.signal(signal.SIGINT)
     assert sender.exit(5.0) == 130
@@ -253,7 +249,7 @@ def test_drive_to_open_survives_invalid_messages_of_other_processes(world):
 
 
 def test_drive_to_exits_130_on_a_signal(world):
-    signals = [(signal.SIGINT,), (signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)]
+    signals = [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)]
     children = [world.start('drive_to', '--no-record', *FAR) for _ in signals]
     for child, numbers in zip(children, signals, strict=True):
         child.until_says(r'goal 1/1 \(50, 0\)')
