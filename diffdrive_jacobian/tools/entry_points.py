@@ -10,14 +10,13 @@ import gc
 import importlib
 import os
 import select
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 
 from diffdrive_jacobian.ros.fastdds_profiles import announce_frequently
-from diffdrive_jacobian.signals import CAUGHT, Signals
+from diffdrive_jacobian.signals import Signals
 
 DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done, not done, wrong arguments, interrupted by a signal."""
@@ -148,8 +147,6 @@ def _remedy(module: str | None) -> str | None:
 
 def _exit(program: str, why: str) -> None:
     """End the process without clean-up, and print why."""
-    # Another signal would print another line.
-    signal.pthread_sigmask(signal.SIG_BLOCK, CAUGHT)
     error = sys.stderr.fileno()
     # Whoever reads it may have stopped reading.
     if select.select([], [error], [], 0.0)[1]:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import gc
 import json
 import os
+import signal
 import subprocess
 import sys
 
 import pytest
 
+from diffdrive_jacobian.signals import CAUGHT, Signals
 from diffdrive_jacobian.tools.entry_points import long_lived
 
 pytestmark = pytest.mark.process
@@ -122,6 +124,25 @@ def test_a_collector_that_was_disabled_before_stays_so():
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_a_process_is_ended_once_however_many_signals_come():
+    ended = []
+
+    def end():
+        ended.append(len(ended))
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    before = {number: signal.getsignal(number) for number in CAUGHT}
+    try:
+        signals = Signals(end)
+        signals.catch()
+        with signals.ending_at_once():
+            os.kill(os.getpid(), signal.SIGHUP)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert (ended, signals.count) == ([0], 2)
 
 
 def test_the_help_of_programs_that_need_ros_imports_nothing_slow():
