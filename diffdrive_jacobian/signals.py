@@ -63,7 +63,7 @@ class Signals:
         self._at_once = True
         try:
             if self._count:
-                self._end()
+                self._end_once()
             yield
         finally:
             self._at_once = False
@@ -113,7 +113,12 @@ class Signals:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._count += 1
+        self._end_once()
+
+    def _end_once(self) -> None:
+        # Another signal may come before the process has ended.
         if self._at_once:
+            self._at_once = False
             self._end()
 
 

@@ -1,59 +1,160 @@
-"""What is wrong with the topics and the clocks of a graph of nodes."""
+"""A graph of nodes as values, and what is wrong with its topics and clocks."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
-from diffdrive_jacobian.diagnosis.description import (
-    Endpoint,
-    Graph,
-    Problem,
-    Quality,
-    Stream,
-)
 from diffdrive_jacobian.messages.names import base_name
 from diffdrive_jacobian.messages.topic_faults import ALTERNATING, SEVERAL, UNPUBLISHED, UNREAD
-from diffdrive_jacobian.messages.topics import CLOCK, TOPICS, Topic
+from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TOPICS, Topic
 from diffdrive_jacobian.text import listed
 
-_UNKNOWN = Topic(name='')
+INFINITE = 2**63 - 1
+"""Duration that means no limit (ns)."""
+INFINITE_FROM = 2**62
+"""Durations from here on mean no limit, too (ns): implementations of DDS round the largest one."""
 COMMANDS = ('cmd_vel', 'joint_command')
 """Topics that must have a subscription."""
+MAX_AGE = 1.0
+"""Largest age of a message on receipt (s)."""
+MAX_AHEAD = 0.1
+"""Largest time by which a stamp may lie in the future (s)."""
+PATIENCE = 1.0
+"""Shortest observation after which a silent /clock is reported (s)."""
 
 
-def _known(topic: str) -> Topic:
-    """Return what is known of a topic of this name, in any namespace."""
-    return TOPICS.get(base_name(topic), _UNKNOWN)
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Something that is wrong or worth knowing, and what to do about it."""
+
+    what: str
+    remedy: str
+    problem: bool = True
+    """Whether something does not work. False: a note."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Quality:
+    """The policies of a quality of service that decide whether two endpoints match."""
+
+    reliability: str = 'RELIABLE'
+    durability: str = 'VOLATILE'
+    liveliness: str = 'AUTOMATIC'
+    deadline: int = INFINITE
+    """Longest period between two messages (ns)."""
+    lease: int = INFINITE
+    """Lease duration of the liveliness (ns)."""
+
+    @classmethod
+    def of(cls, profile: Any) -> Quality:
+        """Return the policies of a profile of rclpy. What is not given there is 0 or the default."""
+        liveliness = profile.liveliness.name
+        return cls(
+            reliability=profile.reliability.name,
+            durability=profile.durability.name,
+            liveliness='AUTOMATIC' if liveliness == 'SYSTEM_DEFAULT' else liveliness,
+            deadline=profile.deadline.nanoseconds or INFINITE,
+            lease=profile.liveliness_lease_duration.nanoseconds or INFINITE,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """A publisher or a subscription."""
+
+    node: str
+    """Fully qualified name of its node."""
+    topic: str
+    """Fully qualified name of the topic."""
+    kind: str
+    """Type of the messages, package/msg/Name."""
+    publishes: bool
+    quality: Quality = Quality()
+
+
+@dataclass(frozen=True, slots=True)
+class Participant:
+    """A node."""
+
+    name: str
+    """Fully qualified name."""
+    use_sim_time: bool | None = None
+    """None: it did not report it."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Stream:
+    """What was received on a topic."""
+
+    topic: str
+    messages: int
+    rate: float
+    """Messages per second."""
+    age: float | None = None
+    """Age of the youngest message on receipt, by the system clock (s). None: no message has a stamp."""
+    simulated_age: float | None = None
+    """The same by the last message on /clock. None: there was none."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClockMessages:
+    """What was received on /clock."""
+
+    messages: int = 0
+    advanced: float = 0.0
+    """Time by which it advanced (s)."""
+    went_back: int = 0
+    """Number of messages with an earlier time than the one before."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Graph:
+    """Nodes with their topics, and what was received while they were observed."""
+
+    nodes: tuple[Participant, ...] = ()
+    endpoints: tuple[Endpoint, ...] = ()
+    streams: tuple[Stream, ...] = ()
+    clock: ClockMessages = ClockMessages()
+    seconds: float = 0.0
+    """Duration of the observation (s)."""
+
+    def topics(self) -> list[str]:
+        """Return the names of the topics, sorted, without those that every node has."""
+        return sorted({one.topic for one in self.endpoints} - set(OF_EVERY_NODE))
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        """Return the publishers of a topic."""
+        return [one for one in self.endpoints if one.topic == topic and one.publishes]
+
+    def subscriptions(self, topic: str) -> list[Endpoint]:
+        """Return the subscriptions to a topic."""
+        return [one for one in self.endpoints if one.topic == topic and not one.publishes]
 
 
 def check_topics(graph: Graph) -> Iterator[Problem]:
     """Yield what keeps nodes from communicating."""
-    yield from _check_names(graph)
-    for topic in graph.topics():
-        yield from _check_types(graph, topic)
-        yield from _check_quality(graph, topic)
-        yield from _check_ends(graph, topic)
-
-
-def _check_names(graph: Graph) -> Iterator[Problem]:
-    names = Counter(node.name for node in graph.nodes)
-    for name, count in sorted(names.items()):
+    for name, count in sorted(Counter(node.name for node in graph.nodes).items()):
         if count > 1:
             yield Problem(
                 f'{count} nodes have the name {name}',
                 'stop one of them, or give each a name or a namespace of its own (-r __node:=NAME, '
                 '-r __ns:=/NAME); one that was killed disappears within 20 s',
             )
+    for topic in graph.topics():
+        yield from _check_types(graph, topic)
+        yield from _check_quality(graph, topic)
+        yield from _check_ends(graph, topic)
 
 
 def _check_types(graph: Graph, topic: str) -> Iterator[Problem]:
-    publishers: dict[str, list[str]] = {}
-    subscriptions: dict[str, list[str]] = {}
-    for one in graph.publishers(topic):
-        publishers.setdefault(one.kind, []).append(one.node)
-    for one in graph.subscriptions(topic):
-        subscriptions.setdefault(one.kind, []).append(one.node)
+    publishers: dict[str, list[str]] = defaultdict(list)
+    subscriptions: dict[str, list[str]] = defaultdict(list)
+    for one in graph.endpoints:
+        if one.topic == topic:
+            (publishers if one.publishes else subscriptions)[one.kind].append(one.node)
     for theirs, sources in sorted(publishers.items()):
         for ours, sinks in sorted(subscriptions.items()):
             if theirs != ours:
@@ -102,10 +203,6 @@ def _duration(nanoseconds: int) -> str:
     return 'no limit' if nanoseconds >= INFINITE_FROM else f'{nanoseconds / 1e9:g} s'
 
 
-INFINITE_FROM = 2**62
-"""Durations from here on mean no limit (ns): implementations of DDS round the largest one."""
-
-
 def _check_quality(graph: Graph, topic: str) -> Iterator[Problem]:
     for subscription in graph.subscriptions(topic):
         publishers = [one for one in graph.publishers(topic) if one.kind == subscription.kind]
@@ -113,23 +210,21 @@ def _check_quality(graph: Graph, topic: str) -> Iterator[Problem]:
         for publisher in bad:
             reasons = mismatch(publisher.quality, subscription.quality)
             rest = ' It receives the other publishers.' if len(bad) < len(publishers) else ''
+            policy = {
+                'reliability': 'reliability:=best_effort',
+                'durability': 'durability:=volatile',
+            }.get(reasons[0].split(':')[0], 'POLICY:=VALUE')
             yield Problem(
                 f'{subscription.node} receives nothing of {publisher.node} on {topic}, because their '
                 f'quality of service does not match ({"; ".join(reasons)}).{rest}',
                 f'change one of both; for nodes of this package as in -p '
-                f'qos_overrides.{topic}.subscription.{_changed_policy(reasons[0])}',
+                f'qos_overrides.{topic}.subscription.{policy}',
             )
 
 
-def _changed_policy(reason: str) -> str:
-    return {
-        'reliability': 'reliability:=best_effort',
-        'durability': 'durability:=volatile',
-    }.get(reason.split(':')[0], 'POLICY:=VALUE')
-
-
 def _check_ends(graph: Graph, topic: str) -> Iterator[Problem]:
-    known, publishers = _known(topic), [one.node for one in graph.publishers(topic)]
+    known = TOPICS.get(base_name(topic), Topic(name=''))
+    publishers = [one.node for one in graph.publishers(topic)]
     # A node that listens to what it publishes itself, as go_to_goal may, does not act on it.
     subscriptions = [one.node for one in graph.subscriptions(topic) if one.node not in publishers]
     for fault in (SEVERAL, ALTERNATING, UNREAD, UNPUBLISHED):
@@ -146,23 +241,11 @@ def _check_ends(graph: Graph, topic: str) -> Iterator[Problem]:
 
 def _namesake(graph: Graph, topic: str, *, publishes: bool) -> str:
     """Return a hint to a topic of the same base name that has the missing end."""
-    others: list[Endpoint] = [
-        one
-        for one in graph.endpoints
-        if one.publishes == publishes and one.topic != topic and base_name(one.topic) == base_name(topic)
-    ]
-    if not others:
-        return ''
-    verb = 'publishes' if publishes else 'subscribes to'
-    return f'; {others[0].node} {verb} {others[0].topic}'
-
-
-MAX_AGE = 1.0
-"""Largest age of a message on receipt (s)."""
-MAX_AHEAD = 0.1
-"""Largest time by which a stamp may lie in the future (s)."""
-PATIENCE = 1.0
-"""Shortest observation after which a silent /clock is reported (s)."""
+    for one in graph.endpoints:
+        same = one.topic != topic and base_name(one.topic) == base_name(topic)
+        if same and one.publishes == publishes:
+            return f'; {one.node} {"publishes" if publishes else "subscribes to"} {one.topic}'
+    return ''
 
 
 def check_clocks(graph: Graph) -> Iterator[Problem]:

@@ -17,7 +17,7 @@ from importlib import metadata
 from pathlib import Path
 
 from diffdrive_jacobian import __version__
-from diffdrive_jacobian.diagnosis.description import Problem
+from diffdrive_jacobian.diagnosis.graph import Problem
 from diffdrive_jacobian.text import format_size, printable
 
 DISTRIBUTION = 'jazzy'

@@ -19,7 +19,7 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
-from diffdrive_jacobian.diagnosis.description import (
+from diffdrive_jacobian.diagnosis.graph import (
     ClockMessages,
     Endpoint,
     Graph,
@@ -93,8 +93,10 @@ class Observer(Node):  # type: ignore[misc]
             known = next((kind for kind in kinds if kind in RECEIVED), None)
             if known is None or topic in self._received or len(self._received) >= MAX_TOPICS:
                 continue
-            if any(info.node_name != self.get_name() for info in self._publishers_of(topic)):
-                self._subscribe(topic, known)
+            if any(
+                info.node_name != self.get_name() for info in self.get_publishers_info_by_topic(topic)
+            ):
+                self._subscribe(topic, RECEIVED[known])
         for name in self._names()[:MAX_NODES]:
             service = f'{name}/get_parameters'
             if name not in self._parameter_clients and '/_' not in name and _is_valid(service):
@@ -107,15 +109,15 @@ class Observer(Node):  # type: ignore[misc]
                 request = GetParameters.Request(names=['use_sim_time'])
                 client.call(request, partial(self._on_answer, name), ignore)
 
-    def _subscribe(self, topic: str, kind: str) -> None:
-        stamp = _stamp_reader(RECEIVED[kind], STAMP) if RECEIVED[kind] in STAMPED else None
+    def _subscribe(self, topic: str, kind: type) -> None:
+        stamp = _stamp_reader(kind, STAMP) if kind in STAMPED else None
         received = self._received[topic] = _Received(stamp)
         # It matches every publisher.
         profile = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
         callback: Callable[[bytes], None] = partial(received.add, self._simulated)
         if topic == CLOCK:
             callback = self._simulated.add
-        self.create_subscription(RECEIVED[kind], topic, callback, profile, raw=True)
+        self.create_subscription(kind, topic, callback, profile, raw=True)
 
     def _on_answer(self, name: str, response: Any) -> None:
         values = response.values
@@ -130,9 +132,6 @@ class Observer(Node):  # type: ignore[misc]
         """
         return [one for one in self.get_topic_names_and_types() if _is_valid(one[0])]
 
-    def _publishers_of(self, topic: str) -> list[Any]:
-        return list(self.get_publishers_info_by_topic(topic))
-
     def _names(self) -> list[str]:
         """Return the fully qualified names of the other nodes, repeated if several have one."""
         names = [full_name(namespace, name) for name, namespace in self.get_node_names_and_namespaces()]
@@ -140,15 +139,22 @@ class Observer(Node):  # type: ignore[misc]
 
     def describe(self, seconds: float) -> Graph:
         """Return the graph as it is now, with what was received in the time before (s)."""
-        endpoints = []
-        for topic, _ in self._topics():
-            for publishes in (True, False):
-                query = self._publishers_of if publishes else self.get_subscriptions_info_by_topic
-                endpoints += [
-                    _endpoint(info, topic, publishes)
-                    for info in query(topic)
-                    if info.node_name != self.get_name()
-                ]
+        endpoints = [
+            Endpoint(
+                node=printable(node_of(info)),
+                topic=printable(topic),
+                kind=printable(info.topic_type),
+                publishes=publishes,
+                quality=Quality.of(info.qos_profile),
+            )
+            for topic, _ in self._topics()
+            for publishes, query in (
+                (True, self.get_publishers_info_by_topic),
+                (False, self.get_subscriptions_info_by_topic),
+            )
+            for info in query(topic)
+            if info.node_name != self.get_name()
+        ]
         return Graph(
             nodes=tuple(
                 Participant(printable(name), self._use_sim_time.get(name))
@@ -170,9 +176,7 @@ class _ClockReceived:
     """What was received on /clock."""
 
     def __init__(self) -> None:
-        self._messages = 0
-        self._went_back = 0
-        self._first = 0
+        self._messages = self._went_back = self._first = 0
         self.last = 0
         """The last time (ns); 0: none was received."""
         self._time = _stamp_reader(Clock, CLOCK_TIME.fields)
@@ -188,12 +192,8 @@ class _ClockReceived:
         self.last = now
 
     def describe(self) -> ClockMessages:
-        """Return the description."""
-        return ClockMessages(
-            messages=self._messages,
-            advanced=(self.last - self._first) / 1e9,
-            went_back=self._went_back,
-        )
+        advanced = (self.last - self._first) / NANOSECONDS
+        return ClockMessages(messages=self._messages, advanced=advanced, went_back=self._went_back)
 
 
 class _Received:
@@ -202,27 +202,24 @@ class _Received:
     def __init__(self, stamp: Callable[[bytes], int] | None) -> None:
         self._stamp = stamp
         self._messages = 0
-        self._first = 0.0
-        self._last = 0.0
+        self._first = self._last = 0.0
         self._age: float | None = None
         self._simulated_age: float | None = None
 
     def add(self, clock: _ClockReceived, data: bytes) -> None:
         """Receive a serialized message."""
-        now = time.monotonic()
-        self._first = self._first or now
-        self._last = now
+        self._last = time.monotonic()
+        self._first = self._first or self._last
         self._messages += 1
         stamp = 0 if self._stamp is None else self._stamp(data)
         if stamp == 0:
             return
         # The youngest one: this process may be late, and others may be.
-        self._age = _nearer(self._age, (time.time_ns() - stamp) / 1e9)
+        self._age = _nearer(self._age, (time.time_ns() - stamp) / NANOSECONDS)
         if clock.last:
-            self._simulated_age = _nearer(self._simulated_age, (clock.last - stamp) / 1e9)
+            self._simulated_age = _nearer(self._simulated_age, (clock.last - stamp) / NANOSECONDS)
 
     def describe(self, topic: str, seconds: float) -> Stream:
-        """Return the description."""
         duration = self._last - self._first
         return Stream(
             topic=topic,
@@ -258,13 +255,3 @@ def _stamp_reader(kind: type, fields: tuple[str, ...]) -> Callable[[bytes], int]
         return int(seconds) * NANOSECONDS + int(nanoseconds)
 
     return stamp
-
-
-def _endpoint(info: Any, topic: str, publishes: bool) -> Endpoint:
-    return Endpoint(
-        node=printable(node_of(info)),
-        topic=printable(topic),
-        kind=printable(info.topic_type),
-        publishes=publishes,
-        quality=Quality.of(info.qos_profile),
-    )

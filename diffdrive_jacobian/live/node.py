@@ -16,8 +16,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from diffdrive_jacobian.control import Path
-from diffdrive_jacobian.drives import in_lockstep, in_real_time
-from diffdrive_jacobian.drives.driving import overrides, recorder_of
+from diffdrive_jacobian.drives import in_lockstep, in_real_time, overrides, recorder_of
 from diffdrive_jacobian.live.commands import Command, Pause, RobotCommand, SetSpeed, Step
 from diffdrive_jacobian.live.live_robot import LiveRobot
 from diffdrive_jacobian.live.robot_state import GoalEnd

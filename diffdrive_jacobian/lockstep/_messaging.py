@@ -9,8 +9,7 @@ from rclpy.duration import Infinite
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
-from diffdrive_jacobian.diagnosis.description import Quality
-from diffdrive_jacobian.diagnosis.graph import mismatch
+from diffdrive_jacobian.diagnosis.graph import Quality, mismatch
 from diffdrive_jacobian.lockstep._errors import LockstepError, described
 from diffdrive_jacobian.lockstep._link import is_latched
 from diffdrive_jacobian.lockstep._nodes import Nodes

@@ -1,47 +1,159 @@
-"""Command lines of the tools: how they are read and refused, and the exit codes."""
+"""Command lines of the tools: how they are parsed, and the options that several tools have."""
 
 from __future__ import annotations
 
 import argparse
 import math
-import sys
-from collections.abc import Sequence
-from typing import Any, TypeVar
+import os
+import re
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from diffdrive_jacobian import __version__
-from diffdrive_jacobian.parameters.declaration import (
-    NodeParameters,
-    specifications,
-)
-from diffdrive_jacobian.text import PATH_LIMIT, printable
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_POSITION
+from diffdrive_jacobian.numerics import fields
+from diffdrive_jacobian.numerics.fields import Check, between, finite, inside, integer, one_of
+from diffdrive_jacobian.parameters.configurations import configurations
+from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, specifications
+from diffdrive_jacobian.tools._output import note
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.control import Path as PlannedPath
 
 T = TypeVar('T')
 
-DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
-"""Exit codes: done, not done, wrong arguments, interrupted by a signal."""
+ROS_HINT = 'ROS arguments come after --ros-args, as in --ros-args -p NAME:=VALUE'
+_ROS_OPTIONS = ('--ros-args', '-p', '--param', '-r', '--remap', '--log-level', '--enclave', '-e')
+_FILE_ENDINGS = ('.png', '.svg', '.pdf', '.jpg', '.jpeg', '.csv', '.txt', '.yaml', '.yml')
+
+# --- Types of arguments
 
 
-class Parser(argparse.ArgumentParser):
-    """A parser with the option that every tool has."""
+def is_number(text: str) -> bool:
+    """Return whether a text is a number as people write it on a command line."""
+    # Python reads more as a number, such as 1_000.
+    if '_' in text or not text.isascii():
+        return False
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
-    def __init__(self, *, prog: str, **kwargs: Any) -> None:
-        """Add `--version`. Arguments as for `argparse.ArgumentParser`."""
-        super().__init__(prog=prog, **kwargs)
-        version = f'{prog} (diffdrive_jacobian) {__version__}'
-        self.add_argument('--version', action='version', version=version, help='print the version')
 
-    @property
-    def long_options(self) -> list[str]:
-        """The options that begin with two dashes."""
-        return [name for name in self._option_string_actions if name.startswith('--')]
+def number(text: str) -> float:
+    """Parse a finite number."""
+    text = text.strip()
+    if not is_number(text):
+        hint = f' ({ROS_HINT})' if ':=' in text else ''
+        raise argparse.ArgumentTypeError(f'must be a number, got {text!r}{hint}')
+    return _checked(finite, float(text))
+
+
+def number_that(check: Check) -> Callable[[str], float]:
+    """Return a type of arguments: the finite numbers that a check accepts."""
+    return lambda text: _checked(check, number(text))
+
+
+def integer_from(low: int, high: float = math.inf) -> Callable[[str], int]:
+    """Return a type of arguments: integers from `low` to `high`."""
+
+    def parse(text: str) -> int:
+        text = text.strip()
+        # Python reads more as an integer than people write on a command line.
+        value = int(text) if re.fullmatch('-?[0-9]{1,99}', text) else text
+        return int(_checked(partial(integer, low=low, high=high), value))
+
+    return parse
+
+
+def _checked(check: Check, value: T) -> T:
+    """Return a value that a check accepts; argparse puts the name of the argument before the message."""
+    try:
+        check('', value)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error).strip()) from None
+    return value
+
+
+def _in_radians(_: str, value: float) -> None:
+    """Require at most one turn: more is probably in degrees."""
+    if not inside(value, -math.tau, math.tau):
+        raise ValueError(
+            f"must be in radians, from -2 pi to 2 pi, got '{value:g}' "
+            f'({value:g} degrees are {math.radians(value):.6g} rad)'
+        )
+
+
+angle = number_that(_in_radians)
+"""Parses an angle (rad)."""
+coordinate = number_that(between(-MAX_POSITION, MAX_POSITION, unit='m'))
+"""Parses a coordinate of a goal (m)."""
+positive = number_that(fields.positive)
+"""Parses a positive finite number."""
+not_negative = number_that(fields.not_negative)
+"""Parses a finite number that is zero or positive."""
+
+
+def tolerance(text: str) -> float:
+    """Parse a distance that is a valid xy_goal_tolerance (m)."""
+    # Not above: it imports every control law.
+    from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
+
+    value = number(text)
+    try:
+        GoToGoalParameters(xy_goal_tolerance=value)
+    except ParameterError as error:
+        raise argparse.ArgumentTypeError(str(error).split("' ", 1)[1]) from error
+    return value
+
+
+def bag_folder(text: str) -> str:
+    """Parse the name of a bag, which is a directory. A name with the ending of a file is rejected."""
+    stem, ending = os.path.splitext(text.rstrip('/'))
+    if ending.lower() in _FILE_ENDINGS:
+        raise argparse.ArgumentTypeError(
+            f'must name a bag, which is a directory, got {text!r}, the name of a file; '
+            f'did you mean {stem!r}?'
+        )
+    return text
+
+
+def namespace(text: str) -> str:
+    """Parse a namespace of ROS; return it with a leading slash, the root as `/`."""
+    found = '/' + text.strip('/')
+    if not re.fullmatch(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+', found):
+        raise argparse.ArgumentTypeError(
+            f'must be a namespace of letters, digits and _, as /robot1, got {text!r}'
+        )
+    return found
+
+
+def _readable_file(text: str) -> str:
+    if not os.path.isfile(text):
+        raise argparse.ArgumentTypeError(f'no such file: {text!r}')
+    if not os.access(text, os.R_OK):
+        raise argparse.ArgumentTypeError(f'file cannot be read: {text!r}')
+    return text
+
+
+def _configuration(name: str) -> str:
+    """Return the path of the installed parameter file of a robot."""
+    installed = configurations()
+    return str(installed[_checked(one_of(*installed), name)])
+
+
+# --- Command lines
 
 
 def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """Separate a tool's own arguments from those between `--ros-args` and `--`.
 
-    Returns:
-        The tool's own arguments and the ROS arguments. Negative numbers of the former get a leading
-        space: argparse regards `-1e3` as an option otherwise.
+    Negative numbers of the former get a leading space: argparse regards `-1e3` as an option otherwise.
     """
     own: list[str] = []
     ros: list[str] = []
@@ -57,122 +169,315 @@ def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     return own, ros
 
 
-def parse(
-    parser: Parser,
-    own: Sequence[str],
-    *,
-    ros: bool = True,
-    parameters: Sequence[type[NodeParameters]] = (),
-    hint: str = '',
-) -> argparse.Namespace:
-    """Parse a tool's own arguments.
+class Parser(argparse.ArgumentParser):
+    """A parser with the options that several tools have.
 
-    An error message about arguments that are not known says what was probably meant.
-
-    Args:
-        parser: The parser.
-        own: The arguments.
-        ros: Whether the tool takes ROS arguments.
-        parameters: Parameters of the nodes that the tool runs.
-        hint: Hint if there is no better one and an argument is no option. Empty: none.
+    Each `add_...` adds an option with its name, type, check and help, so that it is the same everywhere.
     """
-    options, unknown = parser.parse_known_args(own)
-    if unknown:
-        words = [word.strip() for word in unknown]
-        if any(word in _ROS_OPTIONS or ':=' in word for word in words):
-            found = ROS_HINT if ros else f'{parser.prog} takes no ROS arguments'
-        else:
-            found = _meant(parser, words, parameters)
-        if not found and not words[0].startswith('--'):
-            found = hint
-        parser.error(f'unrecognized arguments: {" ".join(words)}' + (f' ({found})' if found else ''))
-    return options
 
+    def __init__(self, *, prog: str, **kwargs: Any) -> None:
+        """Add `--version`. Arguments as for `argparse.ArgumentParser`."""
+        super().__init__(prog=prog, **kwargs)
+        version = f'{prog} (diffdrive_jacobian) {__version__}'
+        self.add_argument('--version', action='version', version=version, help='print the version')
 
-def _meant(parser: Parser, words: Sequence[str], parameters: Sequence[type[NodeParameters]]) -> str:
-    """Return what was probably meant by the first unknown option. Empty: this is not known."""
-    place = next((index for index, word in enumerate(words) if word.startswith('--')), None)
-    if place is None:
-        return ''
-    option, _, value = words[place].partition('=')
-    name = option[2:].replace('-', '_')
-    if any(name in specifications(one) for one in parameters):
-        after = ''.join(words[place + 1 : place + 2])
-        value = value or (after if after and not after.startswith('--') else 'VALUE')
-        return f'{name} is a ROS parameter: --ros-args -p {name}:={value}'
-    # Slow to import.
-    import difflib
+    @property
+    def long_options(self) -> list[str]:
+        """The options that begin with two dashes."""
+        return [name for name in self._option_string_actions if name.startswith('--')]
 
-    close = difflib.get_close_matches(option, parser.long_options, n=1)
-    return f'did you mean {close[0]}?' if close else ''
+    def parse(
+        self,
+        arguments: Sequence[str],
+        *,
+        ros: bool = True,
+        parameters: Sequence[type[NodeParameters]] = (),
+        hint: str = '',
+    ) -> argparse.Namespace:
+        """Parse a command line. An error about unknown arguments says what was probably meant.
 
+        Args:
+            arguments: The command line.
+            ros: Whether the tool takes ROS arguments. They become `ros` of the result, after a file of
+                `--params-file`, over which they take precedence.
+            parameters: Parameters of the nodes that the tool runs.
+            hint: Hint if there is no better one and an argument is no option. Empty: none.
+        """
+        own, of_ros = split_arguments(arguments)
+        options, unknown = self.parse_known_args(own if ros else [*own, *of_ros])
+        if unknown:
+            words = [word.strip() for word in unknown]
+            if any(word in _ROS_OPTIONS or ':=' in word for word in words):
+                found = ROS_HINT if ros else f'{self.prog} takes no ROS arguments'
+            else:
+                found = self._meant(words, parameters)
+            if not found and not words[0].startswith('--'):
+                found = hint
+            self.error(f'unrecognized arguments: {" ".join(words)}' + (f' ({found})' if found else ''))
+        if file := getattr(options, 'params_file', None):
+            of_ros = ['--ros-args', '--params-file', file, '--', *of_ros]
+        options.ros = of_ros
+        return options
 
-ROS_HINT = 'ROS arguments come after --ros-args, as in --ros-args -p NAME:=VALUE'
-_ROS_OPTIONS = ('--ros-args', '-p', '--param', '-r', '--remap', '--log-level', '--enclave', '-e')
+    def _meant(self, words: Sequence[str], parameters: Sequence[type[NodeParameters]]) -> str:
+        """Return what was probably meant by the first unknown option. Empty: this is not known."""
+        place = next((index for index, word in enumerate(words) if word.startswith('--')), None)
+        if place is None:
+            return ''
+        option, _, value = words[place].partition('=')
+        name = option[2:].replace('-', '_')
+        if any(name in specifications(one) for one in parameters):
+            after = ''.join(words[place + 1 : place + 2])
+            value = value or (after if after and not after.startswith('--') else 'VALUE')
+            return f'{name} is a ROS parameter: --ros-args -p {name}:={value}'
+        # Slow to import.
+        import difflib
 
+        close = difflib.get_close_matches(option, self.long_options, n=1)
+        return f'did you mean {close[0]}?' if close else ''
 
-def is_number(text: str) -> bool:
-    """Return whether a text is a number as people write it on a command line."""
-    # Python reads more as a number than people write on a command line.
-    if '_' in text or not text.isascii():
-        return False
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    def refuse_without(self, options: argparse.Namespace, option: str, *needed: str) -> None:
+        """Refuse an option that has no effect without one of others."""
+        if _is_given(options, option) and not any(_is_given(options, one) for one in needed):
+            self.error(f'{option} has no effect without {" or ".join(needed)}')
 
-
-def refuse_without(
-    parser: argparse.ArgumentParser, options: argparse.Namespace, option: str, *needed: str
-) -> None:
-    """Refuse an option that has no effect without one of others.
-
-    Args:
-        parser: The parser.
-        options: The parsed options.
-        option: The option, as `--force`.
-        needed: The others.
-    """
-    if _is_given(options, option) and not any(_is_given(options, one) for one in needed):
-        parser.error(f'{option} has no effect without {" or ".join(needed)}')
-
-
-def refuse_with(
-    parser: argparse.ArgumentParser, options: argparse.Namespace, option: str, *others: str
-) -> None:
-    """Refuse an option that has no effect beside one of others.
-
-    Args:
-        parser: The parser.
-        options: The parsed options.
-        option: The option.
-        others: The others.
-    """
-    for other in others:
+    def refuse_with(self, options: argparse.Namespace, option: str, other: str) -> None:
+        """Refuse an option that has no effect beside another one."""
         if _is_given(options, option) and _is_given(options, other):
-            parser.error(f'{option} has no effect with {other}')
+            self.error(f'{option} has no effect with {other}')
+
+    # --- Values
+
+    def add_value(
+        self,
+        name: str,
+        unit: str,
+        text: str,
+        *,
+        default: object = None,
+        kind: Callable[[str], Any] = positive,
+    ) -> None:
+        """Add an option that has a number, by default a positive one.
+
+        Args:
+            name: Its name, or a short and a long one: `-r --rate`.
+            unit: What the help writes for the value.
+            text: Help. The default is added, if there is one.
+            default: Default. None: the help describes what is done without the option.
+            kind: Type of the argument.
+        """
+        described = text if default is None else f'{text} (default: %(default)s)'
+        self.add_argument(*name.split(), metavar=unit, type=kind, default=default, help=described)
+
+    def add_timeout(self, text: str, default: float | None = None) -> None:
+        """Add the option for the longest duration of what a tool does (s)."""
+        self.add_value('--timeout', 'SECONDS', text, default=default)
+
+    def add_path(self, name: str, what: str = '') -> None:
+        """Add the argument or the option for a path, which `given_path` reads."""
+        text = 'circle:RADIUS, line:LENGTH or eight:SIZE (m), or a .csv or .yaml file of poses'
+        self.add_argument(name, metavar='PATH', help=f'{what}{text}')
+
+    def given_path(self, options: argparse.Namespace) -> PlannedPath:
+        """Return the path that was given; a trajectory has no `--speed`."""
+        # Not above: --help needs no NumPy.
+        from diffdrive_jacobian.control.path_source import PathError, planned_path
+
+        try:
+            path = planned_path(options.path)
+        except PathError as error:
+            self.error(str(error))
+        if len(path.poses) > MAX_PATH_POSES:
+            self.error(f'a path must have at most {MAX_PATH_POSES} poses, got {len(path.poses)}')
+        if path.times is not None and options.speed is not None:
+            self.error(f'--speed has no effect on the trajectory {options.path}, whose poses have times')
+        return path
+
+    def add_heading(self, text: str) -> None:
+        """Add the options for a heading, which `given_heading` evaluates."""
+        self.add_argument('--heading', metavar='RAD', type=number, help=text)
+        self.add_argument(
+            '--degrees', action='store_true', help='the heading is in degrees (default: radians)'
+        )
+
+    def given_heading(self, options: argparse.Namespace) -> float | None:
+        """Return the heading that was given (rad); None: none was. More than one turn is rejected."""
+        value: float | None = options.heading
+        if value is None:
+            if options.degrees:
+                self.error('--degrees needs --heading, whose unit it changes')
+            return None
+        if options.degrees:
+            if not inside(value, -360.0, 360.0):
+                self.error(f"argument --heading: must be from -360 to 360 degrees, got '{value:g}'")
+            return math.radians(value)
+        try:
+            _in_radians('', value)
+        except ValueError as error:
+            self.error(f'argument --heading: {error}; --degrees accepts them')
+        return value
+
+    def add_following(self) -> None:
+        """Add the options for a robot that takes time to follow commands: `following_parameters`."""
+        for name, unit, text in (
+            ('max-acceleration', 'A', 'largest acceleration and deceleration (m/s^2)'),
+            ('max-yaw-acceleration', 'A', 'largest angular acceleration (rad/s^2)'),
+            ('wheel-lag', 'S', 'time constant with which the wheels follow commands (s)'),
+            ('command-delay', 'S', 'time from a command to its effect on the wheels (s)'),
+        ):
+            default = 'no limit' if unit == 'A' else '0'
+            self.add_value(f'--{name}', unit, f'{text} (default: {default})')
+
+    # --- Files
+
+    def add_bag(self, text: str = 'directory of a bag', **kwargs: Any) -> None:
+        """Add the argument for a bag, of type Path. `kwargs` as for `add_argument`, such as `nargs`."""
+        self.add_argument('bag', metavar='BAG', type=Path, help=text, **kwargs)
+
+    def add_bags(self) -> None:
+        """Add the argument for one or more bags, a list of Path, which `given_bags` checks."""
+        self.add_argument('bags', metavar='BAG', type=Path, nargs='+', help='directory of a bag')
+
+    def add_output(self, what: str, text: str, kind: Callable[[str], Any] = str) -> None:
+        """Add the option for the file or the directory to write, for which the help writes `what`."""
+        self.add_argument('-o', '--output', metavar=what, type=kind, help=text)
+
+    def add_force(self, what: str) -> None:
+        """Add the option to overwrite what is named."""
+        self.add_argument('--force', action='store_true', help=f'overwrite {what} (default: refuse)')
+
+    def add_storage(self, default: str | None = None) -> None:
+        """Add the option for the file format of a bag to write. None: that of the bag that is read."""
+        self.add_argument(
+            '-s',
+            '--storage',
+            choices=('mcap', 'sqlite3'),
+            default=default,
+            help=f'storage format (default: {default or "that of BAG"})',
+        )
+
+    def add_params_file(self, text: str = 'file of ROS parameters (YAML)') -> None:
+        """Add the options for a parameter file without `--ros-args`: its path, or the robot's name."""
+        group = self.add_mutually_exclusive_group()
+        group.add_argument('--params-file', metavar='FILE', type=_readable_file, help=text)
+        names = ', '.join(configurations()) or 'none is installed'
+        group.add_argument(
+            '--robot',
+            metavar='NAME',
+            dest='params_file',
+            type=_configuration,
+            help=f'the installed parameter file of a robot: {names}',
+        )
+
+    # --- Topics, nodes and pages
+
+    def add_namespace(self) -> None:
+        """Add the option for a bag of several robots."""
+        self.add_argument(
+            '--namespace',
+            metavar='NS',
+            type=namespace,
+            help='namespace of the robot in a bag of several, as /robot1 (default: that of the only '
+            'robot)',
+        )
+
+    def add_wait_matching(self, what: str, default: str) -> None:
+        """Add the option of `ros2 topic pub` for subscriptions of `what` that are discovered late."""
+        self.add_argument(
+            '-w',
+            '--wait-matching-subscriptions',
+            dest='readers',
+            metavar='N',
+            type=integer_from(1),
+            help=f'wait until {what} N subscriptions (default: {default})',
+        )
+
+    def add_page(self) -> None:
+        """Add the options of the page."""
+        self.add_argument(
+            '--port',
+            metavar='PORT',
+            type=integer_from(1, 65535),
+            default=0,
+            help='TCP port of the page (default: any free one)',
+        )
+        self.add_argument(
+            '--no-browser', action='store_true', help='only print the address, do not open a browser'
+        )
 
 
 def _is_given(options: argparse.Namespace, option: str) -> bool:
-    """Return whether an option was given whose default is None, False or an empty list."""
+    """Return whether an option was given whose default is None or False."""
     value = getattr(options, option.lstrip('-').replace('-', '_'))
-    return not (value is None or value is False or value == [] or value == math.inf)
+    return value is not None and value is not False
 
 
-def complain(program: str, message: object, code: int = USER_ERROR) -> int:
-    """Print an error as argparse does; return the exit code."""
-    print(f'{program}: error: {message}', file=sys.stderr)
-    return code
+# --- What was given
 
 
-def interrupted(program: str, result: str = '') -> int:
-    """Print that a signal was caught, and what became of the files; return the exit code."""
-    print(f'{program}: interrupted{f": {result}" if result else ""}', file=sys.stderr)
-    return INTERRUPTED
+def is_relative(path: str) -> bool:
+    """Return whether a path is a shape, which begins at the robot."""
+    from diffdrive_jacobian.control.path_source import is_shape
+
+    return is_shape(path)
 
 
-def cannot_write(program: str, path: object, error: OSError, result: str = '') -> int:
-    """Print that a file cannot be written, and what was written instead; return the exit code."""
-    message = f'{path} cannot be written: {error.strerror or error}{result}'
-    return complain(program, printable(message, PATH_LIMIT), FAILED)
+def following_parameters(options: argparse.Namespace) -> dict[str, float]:
+    """Return what the options of `add_following` are as parameters of virtual_robot and go_to_goal."""
+    given: dict[str, float | None] = {
+        'wheel_lag': options.wheel_lag,
+        'command_delay': options.command_delay,
+    }
+    for axis, limit in (
+        ('linear.x', options.max_acceleration),
+        ('angular.z', options.max_yaw_acceleration),
+    ):
+        for name, sign in (
+            ('max_acceleration', 1.0),
+            ('max_deceleration', -1.0),
+            ('max_acceleration_reverse', -1.0),
+            ('max_deceleration_reverse', 1.0),
+        ):
+            given[f'{axis}.{name}'] = None if limit is None else sign * limit
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def given_bags(options: argparse.Namespace) -> list[Path]:
+    """Return the bags that were given.
+
+    Raises:
+        UserError: One was given twice.
+    """
+    bags: list[Path] = options.bags
+    if len({bag.resolve() for bag in bags}) < len(bags):
+        raise UserError(f'each bag can be given once, got {" ".join(map(str, bags))}')
+    return bags
+
+
+def warn_of_unused_files(program: str, ros: Sequence[str], nodes: Sequence[str]) -> None:
+    """Print a warning for each `--params-file` in ROS arguments without parameters of any of the nodes.
+
+    Args:
+        program: Name of the program.
+        ros: The ROS arguments.
+        nodes: Fully qualified names of the nodes.
+    """
+    for flag, path in pairwise(ros):
+        if flag == '--params-file' and (why := _unused(path, nodes)):
+            note(program, f'warning: --params-file {path} has no parameters{why}')
+
+
+def _unused(path: str, nodes: Sequence[str]) -> str:
+    """Describe why a file has no effect. Empty: it has one, or is only readable by rcl."""
+    # Slow to import, and a node without such a file does not need it.
+    from diffdrive_jacobian.parameters.file import concerns, sections
+
+    try:
+        names = list(dict.fromkeys(name for name, _ in sections(path)))
+    except UserError:
+        return ''
+    if not names:
+        return ': they stand under NODE: ros__parameters:'
+    if any(concerns(name, node) for name in names for node in nodes):
+        return ''
+    return f' of these nodes: it is for {", ".join(names)}, the nodes are {", ".join(nodes)}'

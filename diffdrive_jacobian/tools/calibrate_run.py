@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,22 +24,22 @@ from diffdrive_jacobian.plots.calibration_figure import draw
 from diffdrive_jacobian.plots.output_files import create, new_file
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools import _cli, _options
-from diffdrive_jacobian.tools._messages import explaining_no_matplotlib
+from diffdrive_jacobian.tools import _cli, _output
+from diffdrive_jacobian.tools.entry_points import DONE, FAILED
 
 PROGRAM = 'calibrate_run'
 ENDINGS = ('yaml', 'yml')
 RADIUS_BOUNDS, SEPARATION_BOUNDS = (1e-3, 10.0), (1e-3, 100.0)
 """Nominal dimensions that the nodes accept (m)."""
+GIVEN = ('yaw_offset', 'time_offset', 'wheel_noise', 'position_noise', 'heading_noise')
+"""Options that are fields of `Given`."""
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
-    own, ros = _cli.split_arguments(arguments)
-    parser = _parser()
-    options = _cli.parse(parser, [*own, *ros], ros=False)
+    options = _parser().parse(arguments, ros=False)
     try:
-        bags = _options.given_bags(options)
+        bags = _cli.given_bags(options)
         output, picture = _outputs(options, bags)
         read: list[WheelsAndReference] = []
         for bag in bags:
@@ -54,30 +53,26 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 )
             )
             for note in read[-1].notes:
-                _note(f'{printable(bag, PATH_LIMIT)}: {note}')
-            if signals.count:
-                return _cli.interrupted(PROGRAM, 'nothing was written')
+                _output.note(PROGRAM, f'{bag}: {note}')
         nominal = _nominal(options, read)
     except ReadingInterruptedError:
-        return _cli.interrupted(PROGRAM, 'nothing was written')
+        return _output.interrupted(PROGRAM, 'nothing was written')
     except (BagError, UserError, ValueError, OSError) as error:
-        return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
+        return _output.complain(PROGRAM, error)
+    lever_arm = None if options.lever_arm is None else tuple(options.lever_arm)
+    given = Given(lever_arm=lever_arm, **{name: getattr(options, name) for name in GIVEN})
     try:
-        result = calibrate([one.recording for one in read], nominal, _given(options))
+        result = calibrate([one.recording for one in read], nominal, given)
     except CalibrationError as error:
-        return _cli.complain(PROGRAM, printable(error, PATH_LIMIT), _cli.FAILED)
+        return _output.complain(PROGRAM, error, FAILED)
     for note in result.notes:
-        _note(note)
+        _output.note(PROGRAM, note)
     if signals.count:
-        return _cli.interrupted(PROGRAM, 'nothing was written')
+        return _output.interrupted(PROGRAM, 'nothing was written')
     _print_summary(result, read)
     if missing := explain_undetermined(result):
-        return _cli.complain(PROGRAM, f'{missing}. Nothing was written', _cli.FAILED)
+        return _output.complain(PROGRAM, f'{missing}. Nothing was written', FAILED)
     return _write(result, read, output, picture, replace=options.force)
-
-
-def _note(text: str) -> None:
-    print(f'{PROGRAM}: {text}', file=sys.stderr)
 
 
 def _print_summary(result: Calibration, read: Sequence[WheelsAndReference]) -> None:
@@ -91,8 +86,7 @@ def _print_summary(result: Calibration, read: Sequence[WheelsAndReference]) -> N
             f'{printable(one.reference_topic)}, {len(recording.wheel_time)} samples of {left} and '
             f'{right} on {printable(one.wheels_topic)}'
         )
-    for line in describe(result):
-        print(line)
+    print(*describe(result), sep='\n')
 
 
 def _write(
@@ -108,10 +102,10 @@ def _write(
     files: list[tuple[Path, bytes]] = [(output, parameter_file(result, names).encode())]
     if picture is not None:
         try:
-            with explaining_no_matplotlib():
+            with _output.explaining_no_matplotlib():
                 files.append((picture, draw(result, 'png')))
         except UserError as error:
-            _note(f'not drawn: {error}')
+            _output.note(PROGRAM, f'not drawn: {error}')
     done: list[Path] = []
     for path, data in files:
         try:
@@ -123,11 +117,11 @@ def _write(
             else:
                 for one in done:
                     one.unlink(missing_ok=True)
-            return _cli.cannot_write(PROGRAM, path, error, what)
+            return _output.cannot_write(PROGRAM, path, error, what)
         done.append(path)
     for path in done:
         print(printable(path, PATH_LIMIT))
-    return _cli.DONE
+    return DONE
 
 
 def _outputs(options: argparse.Namespace, bags: Sequence[Path]) -> tuple[Path, Path | None]:
@@ -179,18 +173,7 @@ def _nominal(options: argparse.Namespace, read: Sequence[WheelsAndReference]) ->
     return Geometry(wheel_radius=radius, wheel_separation=separation)
 
 
-def _given(options: argparse.Namespace) -> Given:
-    return Given(
-        lever_arm=None if options.lever_arm is None else tuple(options.lever_arm),
-        yaw_offset=options.yaw_offset,
-        time_offset=options.time_offset,
-        wheel_noise=options.wheel_noise,
-        position_noise=options.position_noise,
-        heading_noise=options.heading_noise,
-    )
-
-
-_noise = _options.number_that(between(1e-12, 1e3))
+_noise = _cli.number_that(between(1e-12, 1e3))
 """Parses a noise that squares and inverses of floats can represent."""
 
 
@@ -204,15 +187,14 @@ def _parser() -> _cli.Parser:
         'the parameters, contradict each other, or a file cannot be written; 2: wrong arguments, or a '
         'bag cannot be read; 130: interrupted.',
     )
-    _options.add_bags(parser)
-    _options.add_output(
-        parser,
+    parser.add_bags()
+    parser.add_output(
         'FILE',
         'parameter file to write, .yaml; the picture is FILE.png (default: BAG_calibration.yaml '
         'beside the first bag)',
     )
-    _options.add_no_plot(parser, 'do not draw')
-    _options.add_force(parser, 'the parameter file and the picture')
+    parser.add_argument('--no-plot', action='store_true', help='do not draw')
+    parser.add_force('the parameter file and the picture')
     parser.add_argument(
         '--reference',
         metavar='TOPIC',
@@ -234,20 +216,20 @@ def _parser() -> _cli.Parser:
     )
     for name in ('radius', 'separation'):
         text = f'nominal wheel {name} (m) (default: from the parameters in the bag)'
-        _options.add_value(parser, f'--wheel-{name}', 'M', text)
+        parser.add_value(f'--wheel-{name}', 'M', text)
     parser.add_argument(
         '--lever-arm',
         metavar=('X', 'Y'),
         nargs=2,
-        type=_options.coordinate,
+        type=_cli.coordinate,
         help='position of the sensor in the body frame (m) (default: estimated)',
     )
     for name, unit, kind, text in (
-        ('yaw-offset', 'RAD', _options.angle, 'heading of the sensor in the body frame (rad)'),
-        ('time-offset', 'SECONDS', _options.number, 'added to the times of the reference (s)'),
+        ('yaw-offset', 'RAD', _cli.angle, 'heading of the sensor in the body frame (rad)'),
+        ('time-offset', 'SECONDS', _cli.number, 'added to the times of the reference (s)'),
         ('wheel-noise', 'M', _noise, 'variance of the distance travelled by a wheel, per distance (m)'),
         ('position-noise', 'M', _noise, 'standard deviation of the positions of the reference (m)'),
         ('heading-noise', 'RAD', _noise, 'standard deviation of the headings of the reference (rad)'),
     ):
-        _options.add_value(parser, f'--{name}', unit, f'{text} (default: estimated)', kind=kind)
+        parser.add_value(f'--{name}', unit, f'{text} (default: estimated)', kind=kind)
     return parser

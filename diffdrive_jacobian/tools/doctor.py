@@ -7,8 +7,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
-from diffdrive_jacobian.diagnosis.description import Graph, Participant, Problem
-from diffdrive_jacobian.diagnosis.graph import check_clocks, check_topics
+from diffdrive_jacobian.diagnosis.graph import Graph, Participant, Problem, check_clocks, check_topics
 from diffdrive_jacobian.diagnosis.machine import (
     Environment,
     check_environment,
@@ -22,9 +21,9 @@ from diffdrive_jacobian.diagnosis.machine import (
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
-from diffdrive_jacobian.tools import _cli, _options
-from diffdrive_jacobian.tools._messages import counted
-from diffdrive_jacobian.tools._startup import long_lived
+from diffdrive_jacobian.tools import _cli, _output
+from diffdrive_jacobian.tools._output import counted
+from diffdrive_jacobian.tools.entry_points import DONE, FAILED, INTERRUPTED, long_lived
 
 PROGRAM = 'doctor'
 DISCOVERY = 3.5
@@ -52,37 +51,36 @@ class Diagnosis:
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
-    own, ros = _cli.split_arguments(arguments)
-    options = _cli.parse(_parser(), own)
+    options = _parser().parse(arguments)
     found = environment()
     if not options.json:
         print(*_heading(found), sep='\n', flush=True)
-    findings = [
-        *check_environment(found),
-        *check_shared_memory(shared_memory()),
-        *check_network(interfaces(), found.reach, multicast_error() if found.reach == 'SUBNET' else ''),
-    ]
+    multicast = multicast_error() if found.reach == 'SUBNET' else ''
+    findings = list(check_environment(found))
+    usable = not any(one.problem for one in findings)
+    findings += check_shared_memory(shared_memory())
+    findings += check_network(interfaces(), found.reach, multicast)
     rmw, graph = '', Graph()
-    if not any(one.problem for one in check_environment(found)):
+    if usable:
         try:
-            rmw, graph = _observe(options, ros, signals)
+            rmw, graph = _observe(options, signals)
         except UserError as error:
-            return _cli.complain(PROGRAM, error)
+            return _output.complain(PROGRAM, error)
         except (ImportError, OSError, RuntimeError) as error:
             why = printable(' '.join(str(error).split()), 300)
             findings.append(Problem(f'ROS cannot be used: {why}', INSTALL))
     findings += [*check_topics(graph), *check_clocks(graph)]
     if signals.count:
-        return _cli.INTERRUPTED
+        return INTERRUPTED
     diagnosis = Diagnosis(environment=found, rmw=rmw, graph=graph, findings=tuple(findings))
     if options.json:
         print(json.dumps(asdict(diagnosis), indent=2))
     else:
         print(*_report(diagnosis), sep='\n')
-    return _cli.FAILED if diagnosis.problems else _cli.DONE
+    return FAILED if diagnosis.problems else DONE
 
 
-def _observe(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> tuple[str, Graph]:
+def _observe(options: argparse.Namespace, signals: Signals) -> tuple[str, Graph]:
     """Return the name of the middleware, and the graph."""
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS, and a diagnosis without ROS is one as well.
@@ -96,9 +94,8 @@ def _observe(options: argparse.Namespace, ros: Sequence[str], signals: Signals) 
             f'(those that run already are announced every 3 s)',
             flush=True,
         )
-    return get_rmw_implementation_identifier(), observe(
-        options.timeout, ros_arguments=ros, signals=signals
-    )
+    graph = observe(options.timeout, ros_arguments=options.ros, signals=signals)
+    return get_rmw_implementation_identifier(), graph
 
 
 def _heading(found: Environment) -> Iterator[str]:
@@ -167,8 +164,6 @@ def _parser() -> _cli.Parser:
         'its remedy. Exit code 0: no problem was found; 1: there are problems; 2: wrong arguments; 130: '
         'interrupted.',
     )
-    _options.add_timeout(
-        parser, 'duration of the discovery and of the observation (s)', default=DISCOVERY
-    )
+    parser.add_timeout('duration of the discovery and of the observation (s)', default=DISCOVERY)
     parser.add_argument('--json', action='store_true', help='print the report as JSON')
     return parser

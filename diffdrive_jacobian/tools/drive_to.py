@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import sys
+import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -19,9 +20,8 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.nodes import CONTROLLERS, NODE_PARAMETERS
 from diffdrive_jacobian.plots.output_files import NOT_OVERWRITTEN
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli, _options, _page
-from diffdrive_jacobian.tools._messages import NO_MATPLOTLIB, busy, describe_distances
-from diffdrive_jacobian.tools._startup import long_lived
+from diffdrive_jacobian.tools import _cli, _output, watch_run
+from diffdrive_jacobian.tools.entry_points import DONE, FAILED, INTERRUPTED, long_lived
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.drives import Outcome
@@ -29,25 +29,86 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.recording.recording import Recording
 
 PROGRAM = 'drive_to'
+DRIVES = 'whoever knows this address can steer the robot; it goes on after the goals, until Ctrl-C'
 Goals: TypeAlias = NDArray[np.float64] | PlannedPath
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
-    own, ros = _cli.split_arguments(arguments)
     parser = _parser()
-    options = _cli.parse(parser, own, parameters=NODE_PARAMETERS)
+    options = parser.parse(arguments, parameters=NODE_PARAMETERS)
+    _check(parser, options)
+    heading = parser.given_heading(options)
+    path = None if options.path is None else parser.given_path(options)
+    with long_lived(), signals.ending_at_once():
+        # Not above: --help needs no ROS.
+        from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
+        from diffdrive_jacobian.recording.record import open_recording, saved_on_error
+
+    goals: Goals = np.empty((0, 3))
+    if path is not None:
+        goals = path
+    elif options.coordinates:
+        goals = waypoints_through(np.reshape(options.coordinates, (-1, 2)), heading or 0.0)
+    recording = None
+    if not options.no_record:
+        try:
+            recording = open_recording(
+                'drive', options.output, 'mcap', lossless=options.lockstep, replace=options.force
+            )
+        except OSError as error:
+            return _output.complain(PROGRAM, error)
+    picture = None if recording is None or options.no_plot or options.live else _picture(recording)
+    if recording is not None and picture and os.path.lexists(picture) and not options.force:
+        recording.discard()
+        return _output.complain(PROGRAM, f'{picture} exists already; {NOT_OVERWRITTEN}')
+    ros = ['--ros-args', '--log-level', 'warn', '--', *options.ros]
+    how: dict[str, Any] = {
+        'relative': path is not None and _cli.is_relative(options.path),
+        'lockstep': options.lockstep,
+        'isolated': not options.open,
+        'parameters': _controller_parameters(options),
+        'robot_parameters': _cli.following_parameters(options),
+        'recording': recording,
+        'ros_arguments': ros,
+        'signals': signals,
+    }
+    code = FAILED
+    try:
+        with saved_on_error(recording):
+            try:
+                if options.live:
+                    code = _drive_with_page(goals, options, how)
+                else:
+                    with closing(_Progress(goals, options, ros)) as progress:
+                        outcome = drive(goals, timeout=options.timeout, progress=progress, **how)
+                    code = _print_outcome(outcome, options)
+            except DriveError as error:
+                # The recording shows what led to it.
+                _output.complain(PROGRAM, error)
+    except watch_run.PageError as error:
+        return _output.complain(PROGRAM, error, FAILED)
+    except UserError as error:
+        return _output.complain(PROGRAM, error)
+    if recording is None:
+        return code
+    saved = _save(recording, picture, replace=options.force)
+    # An interruption remains one.
+    return code if code == INTERRUPTED else saved or code
+
+
+def _check(parser: _cli.Parser, options: argparse.Namespace) -> None:
+    """Refuse options that have no effect, or exclude each other."""
     if len(options.coordinates) % 2:
         parser.error(f'coordinates must be pairs X Y, got {len(options.coordinates)} of them')
     if options.path is None:
         for option in ('--speed', '--path-controller'):
-            _cli.refuse_without(parser, options, option, '--path')
+            parser.refuse_without(options, option, '--path')
     elif options.coordinates or options.heading is not None:
         parser.error('--path excludes X Y and --heading')
-    heading = _options.given_heading(parser, options)
     for option in ('--output', '--force'):
-        _cli.refuse_with(parser, options, option, '--no-record')
-    _cli.refuse_without(parser, options, '--force', '--output')
+        parser.refuse_with(options, option, '--no-record')
+    parser.refuse_without(options, '--force', '--output')
     if options.lockstep and options.open:
         parser.error('--lockstep and --open exclude each other: other processes have another clock')
     if not options.live:
@@ -59,154 +120,39 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             parser.error('--port and --no-browser are options of --live')
     elif options.timeout != parser.get_default('timeout'):
         parser.error('--timeout has no effect with --live, which ends by Ctrl-C')
-    path = None if options.path is None else _options.given_path(parser, options)
-    ros = ['--ros-args', '--log-level', 'warn', '--', *_options.with_params_file(ros, options)]
-    with long_lived(), signals.ending_at_once():
-        # Not above: --help needs no ROS.
-        from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
-        from diffdrive_jacobian.recording.record import saved_on_error
-
-    goals: Goals = np.empty((0, 3))
-    if path is not None:
-        goals = path
-    elif options.coordinates:
-        goals = waypoints_through(np.reshape(options.coordinates, (-1, 2)), heading or 0.0)
-    relative = path is not None and _options.is_relative(options.path)
-    if options.live:
-        return _drive_with_page(options, goals, relative, ros, signals)
-    try:
-        recording = _recording(options)
-    except OSError as error:
-        return _cli.complain(PROGRAM, error)
-    kept = recording is None or options.no_plot or options.force
-    if recording is not None and not kept and os.path.lexists(picture := _picture(recording)):
-        recording.discard()
-        return _cli.complain(PROGRAM, f'{picture} exists already; {NOT_OVERWRITTEN}')
-    outcome = None
-    try:
-        with (
-            saved_on_error(recording),
-            _Progress(goals, options.path, ros, wall=not options.lockstep) as progress,
-        ):
-            try:
-                outcome = drive(
-                    goals,
-                    relative=relative,
-                    lockstep=options.lockstep,
-                    isolated=not options.open,
-                    timeout=options.timeout,
-                    parameters=_controller_parameters(options),
-                    robot_parameters=_options.following_parameters(options),
-                    recording=recording,
-                    ros_arguments=ros,
-                    signals=signals,
-                    progress=progress,
-                )
-            except DriveError as error:
-                # The recording shows what led to it.
-                print(f'{PROGRAM}: error: {error}', file=sys.stderr)
-    except UserError as error:
-        return _cli.complain(PROGRAM, error)
-    code = _cli.FAILED if outcome is None else _print_outcome(outcome, options)
-    if recording is None:
-        return code
-    saved = _save(recording, plot=not options.no_plot, replace=options.force)
-    # An interruption remains one.
-    return code if code == _cli.INTERRUPTED else saved or code
 
 
-def _drive_with_page(
-    options: argparse.Namespace,
-    goals: Goals,
-    relative: bool,
-    ros: Sequence[str],
-    signals: Signals,
-) -> int:
-    """Drive with the page until Ctrl-C; return the exit code.
+def _drive_with_page(goals: Goals, options: argparse.Namespace, how: dict[str, Any]) -> int:
+    """Drive with the page until Ctrl-C; return the exit code. `how`: arguments of `drive`."""
+    given = len(options.coordinates) > 0 or options.path is not None
+    with watch_run.explaining_page_errors(options.port):
+        from diffdrive_jacobian.live.node import drive_live
 
-    Args:
-        options: The options.
-        goals: Goals, or a path.
-        relative: Whether they are in the body frame of the robot where it starts.
-        ros: ROS arguments of all nodes.
-        signals: Counter of the signals.
-    """
-    # Not above: --help needs no ROS.
-    from diffdrive_jacobian.drives import DriveError
-    from diffdrive_jacobian.recording.record import saved_on_error
-
-    recording, given = None, bool(options.coordinates or options.path)
-    try:
-        with _page.explaining_page_errors(options.port):
-            from diffdrive_jacobian.live.node import drive_live
-
-        recording = _recording(options)
-        # Where the page cannot be served, the recording is discarded.
-        with saved_on_error(recording), _page.explaining_page_errors(options.port):
-            drive_live(
-                goals,
-                relative=relative,
-                lockstep=options.lockstep,
-                isolated=not options.open,
-                parameters=_controller_parameters(options),
-                robot_parameters=_options.following_parameters(options),
-                recording=recording,
-                ros_arguments=ros,
-                port=options.port,
-                signals=signals,
-                ready=_page.announcing(
-                    options,
-                    waiting='the drive starts' if given else '',
-                    notice=_page.DRIVES if given else _page.STEERS,
-                ),
-                nodes_created=lambda names: _options.warn_of_unused_files(PROGRAM, ros, names),
-                goal_ended=_print_goal_end,
-            )
-    except _page.PageError as error:
-        return _cli.complain(PROGRAM, error, _cli.FAILED)
-    except UserError as error:
-        return _cli.complain(PROGRAM, error)
-    except (DriveError, OSError) as error:
-        return _cli.complain(PROGRAM, error, _cli.FAILED)
-    return _cli.DONE if recording is None else _save(recording, plot=False, replace=options.force)
+        drive_live(
+            goals,
+            port=options.port,
+            ready=watch_run.announcing(
+                options,
+                waiting='the drive starts' if given else '',
+                notice=DRIVES if given else watch_run.STEERS,
+            ),
+            nodes_created=lambda names: _cli.warn_of_unused_files(PROGRAM, how['ros_arguments'], names),
+            goal_ended=_print_goal_end,
+            **how,
+        )
+    return DONE
 
 
-def _recording(options: argparse.Namespace) -> Recording | None:
-    """Open the recording of the drive; None: none is wanted.
-
-    Raises:
-        OSError: It cannot be written, or exists.
-    """
-    if options.no_record:
-        return None
-    from diffdrive_jacobian.recording.record import open_recording
-
-    return open_recording(
-        'drive', options.output, 'mcap', lossless=options.lockstep, replace=options.force
-    )
-
-
-class _Progress:
+class _Progress(_output.GoalBar):
     """Prints the progress of a drive."""
 
-    def __init__(self, goals: Goals, path: str | None, ros: Sequence[str], *, wall: bool) -> None:
-        # Slow to import.
-        from diffdrive_jacobian.tools._progress import GoalBar
-
-        self._goals, self._path = goals, path
-        self._ros = ros
+    def __init__(self, goals: Goals, options: argparse.Namespace, ros: Sequence[str]) -> None:
+        super().__init__((lambda: self._seconds) if options.lockstep else time.monotonic)
+        self._goals, self._path, self._ros = goals, options.path, ros
         self._seconds = 0.0
-        self._bar = GoalBar() if wall else GoalBar(lambda: self._seconds)
-
-    def __enter__(self) -> _Progress:
-        self._bar.__enter__()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.__exit__()
 
     def nodes_created(self, names: Sequence[str]) -> None:
-        _options.warn_of_unused_files(PROGRAM, self._ros, names)
+        _cli.warn_of_unused_files(PROGRAM, self._ros, names)
 
     def driving(self, seconds: float, index: int, distance: float, wheels: tuple[float, float]) -> None:
         self._seconds = seconds
@@ -214,13 +160,13 @@ class _Progress:
         if not isinstance(self._goals, PlannedPath):
             x, y, _ = self._goals[index]
             what = f'goal {index + 1}/{len(self._goals)} ({x:g}, {y:g})'
-        self._bar.show(what, distance, wheels)
+        self.show_goal(what, distance, wheels)
 
 
 def _controller_parameters(options: argparse.Namespace) -> dict[str, Any]:
     """Return the controller's parameters that were given by an option of their own."""
     given = {
-        **_options.following_parameters(options),
+        **_cli.following_parameters(options),
         'xy_goal_tolerance': options.tolerance,
         'controller': options.controller,
         'path_controller': options.path_controller,
@@ -235,36 +181,40 @@ def _picture(recording: Recording) -> Path:
     return recording.bag.with_name(recording.bag.name + '.png')
 
 
-def _save(recording: Recording, *, plot: bool, replace: bool) -> int:
+def _save(recording: Recording, picture: Path | None, *, replace: bool) -> int:
     """Write the bag and its picture, and print their names; return the exit code."""
     from diffdrive_jacobian.bags.run_reader import BagError, read_run
     from diffdrive_jacobian.plots.run_figure import draw
     from diffdrive_jacobian.recording.recording import RecordingError
 
-    code = _cli.DONE
+    code = DONE
     try:
-        with busy(PROGRAM, f'writing {recording.bag}'):
+        with _output.busy(PROGRAM, f'writing {recording.bag}'):
             recording.finish()
         print(f'recorded: {recording.bag}')
     except RecordingError as error:
-        print(f'{PROGRAM}: error: {error}', file=sys.stderr)
+        code = _output.complain(PROGRAM, error, FAILED)
         if error.summary is None:
-            return _cli.FAILED
+            return code
         print(f'recorded in part: {recording.bag}')
-        code = _cli.FAILED
-    if not plot:
+    if picture is None:
         return code
-    picture = _picture(recording)
     try:
-        with busy(PROGRAM, f'drawing {picture}'):
+        with _output.busy(PROGRAM, f'drawing {picture}'):
             draw([read_run(recording.bag)], picture, replace=replace)
         print(f'drawn: {picture}')
     except ModuleNotFoundError:
-        print(f'not drawn: {NO_MATPLOTLIB}')
+        print(f'not drawn: {_output.NO_MATPLOTLIB}')
     except (OSError, BagError) as error:
-        print(f'{PROGRAM}: error: {error}', file=sys.stderr)
-        return _cli.FAILED
+        return _output.complain(PROGRAM, error, FAILED)
     return code
+
+
+def _describe_distances(distance: float, true_distance: float) -> str:
+    """Return how far a robot is from its goal (m), in words. A true distance of NaN is not known."""
+    if math.isnan(true_distance):
+        return f'{distance:.3f} m from the goal'
+    return f'{distance:.3f} m from the goal by odometry, {true_distance:.3f} m by ground truth'
 
 
 def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
@@ -276,7 +226,7 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
         point = f' with the driven point (x {outcome.offset:g} m in the body frame)'
         point = point if outcome.offset else ''
         simulated = ' of simulated time' if options.lockstep else ''
-        distances = describe_distances(outcome.distance, outcome.true_distance) + point
+        distances = _describe_distances(outcome.distance, outcome.true_distance) + point
         if options.path is not None:
             side = 'from' if outcome.arrived else 'before'
             distances = f'{outcome.distance:.3f} m {side} the end of the path'
@@ -296,12 +246,12 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
                 f'the robot rolled out of the tolerance of {outcome.tolerance:g} m: the parameters '
                 'stop_in_time and trans_stopped_velocity avoid that'
             )
-        return _cli.DONE
+        return DONE
     if outcome.interrupted:
         print(f'interrupted: {where}')
-        return _cli.INTERRUPTED
+        return INTERRUPTED
     print(f'not arrived ({_reason(outcome, options.timeout)}): {where}')
-    return _cli.FAILED
+    return FAILED
 
 
 def _reason(outcome: Outcome, timeout: float) -> str:
@@ -331,7 +281,7 @@ def _print_goal_end(end: GoalEnd) -> None:
         x, y, theta = end.pose
         where = (
             f'the robot is at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
-            f'{describe_distances(end.distance, end.true_distance)}'
+            f'{_describe_distances(end.distance, end.true_distance)}'
         )
     robot = '' if end.robot == '/' else f'{end.robot}: '
     print(f'{robot}goal ({end.goal[0]:g}, {end.goal[1]:g}) {ends[end.state]}: {where}', flush=True)
@@ -349,28 +299,25 @@ def _parser() -> _cli.Parser:
         'coordinates',
         metavar='X Y',
         nargs='*',
-        type=_options.coordinate,
+        type=_cli.coordinate,
         help='x and y of each goal (m)',
     )
-    _options.add_timeout(
-        parser, 'longest duration of the drive, of all goals together (s)', default=300.0
-    )
-    _options.add_value(
-        parser,
+    parser.add_timeout('longest duration of the drive, of all goals together (s)', default=300.0)
+    parser.add_value(
         '--tolerance',
         'M',
         'distance to a goal that counts as arrived (m) (default: 0.02, unless a file sets it)',
-        kind=_options.tolerance,
+        kind=_cli.tolerance,
     )
-    _options.add_heading(parser, 'heading at the last goal (rad) (default: any)')
-    _options.add_controller(
-        parser,
-        CONTROLLERS,
-        'controller: %(choices)s (default: go_to_goal, unless a file names another)',
+    parser.add_heading('heading at the last goal (rad) (default: any)')
+    parser.add_argument(
+        '--controller',
+        choices=CONTROLLERS,
+        metavar='NAME',
+        help='controller: %(choices)s (default: go_to_goal, unless a file names another)',
     )
-    _options.add_path(parser, '--path', 'drive along a path: ')
-    _options.add_value(
-        parser,
+    parser.add_path('--path', 'drive along a path: ')
+    parser.add_value(
         '--speed',
         'M/S',
         'speed along a path without times (m/s) (default: 0.2, unless a file sets it)',
@@ -381,17 +328,16 @@ def _parser() -> _cli.Parser:
         metavar='NAME',
         help='controller of the path: %(choices)s (default: pure_pursuit, unless a file names another)',
     )
-    _options.add_following(parser)
-    _options.add_params_file(parser)
-    _options.add_output(
-        parser,
+    parser.add_following()
+    parser.add_params_file()
+    parser.add_output(
         'BAG',
         'directory of the rosbag2 bag to record to; the picture is BAG.png (default: drive_DATE-TIME)',
-        kind=_options.bag_folder,
+        kind=_cli.bag_folder,
     )
-    _options.add_force(parser, 'BAG and BAG.png, at the end of the drive')
+    parser.add_force('BAG and BAG.png, at the end of the drive')
     parser.add_argument('--no-record', action='store_true', help='neither record nor draw')
-    _options.add_no_plot(parser, 'record, but do not draw')
+    parser.add_argument('--no-plot', action='store_true', help='record, but do not draw')
     parser.add_argument(
         '--lockstep',
         action='store_true',
@@ -409,5 +355,5 @@ def _parser() -> _cli.Parser:
         help='show the drive on a page in the browser and steer the robot there, until Ctrl-C; without '
         'X Y the robot waits for goals; the bag is recorded, no picture is drawn',
     )
-    _options.add_page(parser)
+    parser.add_page()
     return parser

@@ -6,23 +6,20 @@ Each node in `NODES` is a program, and each other public module of this package,
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
 import select
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 
 from diffdrive_jacobian.ros.fastdds_profiles import announce_frequently
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools._startup import (
-    long_lived,
-    without_blas_threads,
-    without_message_generator,
-)
 
-DONE = 0
-INTERRUPTED = 130
+DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
+"""Exit codes: done, not done, wrong arguments, interrupted by a signal."""
 OUTPUT_ERROR = 'the standard output cannot be written'
 NODES = ('virtual_robot', 'go_to_goal', 'wheel_bridge')
 """Programs that run a node."""
@@ -35,7 +32,6 @@ ROS_MODULES = (
 """Modules of a ROS installation, or of the extra `jazzy`."""
 ROSBAGS_MODULES = ('rosbags', 'apsw', 'backports', 'backports.zstd', 'lz4', 'ruamel', 'ruamel.yaml')
 """Modules that come with rosbags, which a ROS installation does not bring."""
-_NO_TOOLS = ('__init__', 'entry_points', 'run_node')
 
 
 def __getattr__(name: str) -> Callable[[], int]:
@@ -44,10 +40,8 @@ def __getattr__(name: str) -> Callable[[], int]:
     Raises:
         AttributeError: There is no such program.
     """
-    if name in NODES:
-        return partial(_run, 'run_node', 'run_node', name)
-    if name in tools():
-        return partial(_run, name, 'main', watched=True)
+    if name in NODES or name in tools():
+        return partial(_run, name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
 
@@ -59,27 +53,31 @@ def __dir__() -> list[str]:
 def tools() -> list[str]:
     """Return the names of the tools: those of the public modules beside this one."""
     files = (os.path.splitext(file) for file in os.listdir(os.path.dirname(__file__)))
-    return sorted(
-        name
-        for name, ending in files
-        if ending == '.py' and not name.startswith('_') and name not in _NO_TOOLS
-    )
+    public = {name for name, ending in files if ending == '.py' and not name.startswith('_')}
+    return sorted(public - {'entry_points', 'run_node'})
 
 
-def _run(module: str, function: str, *arguments: str, watched: bool = False) -> int:
-    """Run a function of a module of this package; return the exit code.
+@contextmanager
+def long_lived() -> Iterator[None]:
+    """Create objects that last as long as the process, such as modules and nodes.
 
-    Args:
-        module: The module.
-        function: The function. It takes the arguments, the command line and the signals.
-        arguments: The first of them is the name of the program (default: the module's).
-        watched: Whether a second signal ends the process even if the function does not react.
+    The garbage collector would visit all of them again and again, and find nothing. It pauses here, and
+    does not visit them later. This affects the whole process, so the library does not use it.
     """
-    program = arguments[0] if arguments else module
-    if program in UNTIL_SIGNAL:
-        signals = Signals(partial(os._exit, DONE))
-    else:
-        signals = Signals(partial(_exit, program, 'interrupted'))
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.freeze()
+            gc.enable()
+
+
+def _run(program: str) -> int:
+    """Run a program with the command line of this process, and return the exit code."""
+    end = partial(_exit, program, 'interrupted')
+    signals = Signals(partial(os._exit, DONE) if program in UNTIL_SIGNAL else end)
     signals.catch()
     for name in ('stdout', 'stderr'):
         if getattr(sys, name) is None:
@@ -87,28 +85,36 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
             for replaced in (name, f'__{name}__'):
                 setattr(sys, replaced, open(os.devnull, 'w'))  # noqa: SIM115
     announce_frequently()
-    without_message_generator()
-    without_blas_threads()
+    # A message class imports this package for one function. It does without the generator and the parser
+    # of definitions, which take longer than to create a node, where they cannot be imported.
+    if 'rosidl_generator_py' not in sys.modules:
+        sys.modules['rosidl_generator_py.generate_py_impl'] = None  # type: ignore[assignment]
+    # OpenBLAS starts a thread for each further core when NumPy is imported, each of which is busy for
+    # milliseconds. The matrices of a robot are too small for threads.
+    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     try:
         with long_lived(), signals.ending_at_once():
-            run = getattr(importlib.import_module(f'diffdrive_jacobian.tools.{module}'), function)
-        if watched:
+            module = 'run_node' if program in NODES else program
+            run = importlib.import_module(f'diffdrive_jacobian.tools.{module}')
+        if program in NODES:
+            code: int = run.run_node(program, sys.argv[1:], signals)
+        else:
             why = 'ended by a second signal, before it could finish'
             signals.exit_on_second(partial(_exit, program, why))
-        code: int = run(*arguments, sys.argv[1:], signals)
+            code = run.main(sys.argv[1:], signals)
     except BrokenPipeError:
         # The reader of the output is gone, as `head` when it has enough.
         _discard_output()
-        code = 1
+        code = FAILED
     except ModuleNotFoundError as error:
         remedy = _remedy(error.name)
         if remedy is None:
             raise
         print(f'{program}: error: {remedy}', file=sys.stderr)
-        code = 1
+        code = FAILED
     except OSError as error:
         print(f'{program}: error: {error}', file=sys.stderr)
-        code = 1
+        code = FAILED
     finally:
         signals.ignore()
     try:
@@ -117,7 +123,7 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
         if not isinstance(error, BrokenPipeError):
             print(f'{program}: error: {OUTPUT_ERROR}: {error.strerror}', file=sys.stderr)
         _discard_output()
-        code = 1
+        code = FAILED
     return code
 
 
@@ -141,9 +147,8 @@ def _remedy(module: str | None) -> str | None:
 
 def _exit(program: str, why: str) -> None:
     """End the process without clean-up, and print why."""
-    line = f'{program}: {why}\n'
     error = sys.stderr.fileno()
     # Whoever reads it may have stopped reading.
     if select.select([], [error], [], 0.0)[1]:
-        os.write(error, line.encode())
+        os.write(error, f'{program}: {why}\n'.encode())
     os._exit(INTERRUPTED)

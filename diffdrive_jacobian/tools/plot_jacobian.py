@@ -10,34 +10,34 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, new_file
 from diffdrive_jacobian.plots.rendering import render, styled
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli, _options
-from diffdrive_jacobian.tools._messages import busy, explaining_no_matplotlib
+from diffdrive_jacobian.tools import _cli, _output
+from diffdrive_jacobian.tools.entry_points import DONE
 
 PROGRAM = 'plot_jacobian'
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
-    options = _cli.parse(_parser(), arguments, ros=False)
+    options = _parser().parse(arguments, ros=False)
     output = f'{options.name}.png' if options.output is None else options.output
     try:
         path = new_file(output, FORMATS, 'picture', replace=options.force)
         with (
-            explaining_no_matplotlib(),
-            busy(PROGRAM, 'drawing'),
+            _output.explaining_no_matplotlib(),
+            _output.busy(PROGRAM, 'drawing'),
             signals.ending_at_once(),
             styled(),
         ):
             content = render(getattr(plots, options.name)(), extension(path))
         if signals.count:
-            return _cli.interrupted(PROGRAM, 'nothing was written')
+            return _output.interrupted(PROGRAM, 'nothing was written')
         create(path, content, replace=options.force)
     except (ValueError, UserError, FileExistsError) as error:
-        return _cli.complain(PROGRAM, error)
+        return _output.complain(PROGRAM, error)
     except OSError as error:
-        return _cli.cannot_write(PROGRAM, output, error)
+        return _output.cannot_write(PROGRAM, output, error)
     print(path)
-    return _cli.DONE
+    return DONE
 
 
 def _name(text: str) -> str:
@@ -59,6 +59,6 @@ def _parser() -> _cli.Parser:
         'be written; 2: wrong arguments, or no matplotlib; 130: interrupted.',
     )
     parser.add_argument('name', metavar='NAME', type=_name, help='the picture, one of those above')
-    _options.add_output(parser, 'FILE', f'file to write, .{", .".join(FORMATS)} (default: NAME.png)')
-    _options.add_force(parser, 'the file')
+    parser.add_output('FILE', f'file to write, .{", .".join(FORMATS)} (default: NAME.png)')
+    parser.add_force('the file')
     return parser

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -14,38 +13,34 @@ from diffdrive_jacobian.bags.run_reader import read_run
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.topics import READABLE
-from diffdrive_jacobian.plots.output_files import FORMATS, NOT_OVERWRITTEN, check_directory
+from diffdrive_jacobian.plots.output_files import FORMATS, check_directory, new_file
 from diffdrive_jacobian.plots.run_figure import draw, names
 from diffdrive_jacobian.plots.run_table import DECIMALS, write_csv
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools import _cli, _options
-from diffdrive_jacobian.tools._messages import busy, explaining_no_matplotlib
-from diffdrive_jacobian.tools.entry_points import OUTPUT_ERROR
+from diffdrive_jacobian.tools import _cli, _output
+from diffdrive_jacobian.tools.entry_points import DONE, FAILED, OUTPUT_ERROR
 
 PROGRAM = 'plot_run'
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
-    options = _parser().parse_args(arguments)
+    options = _parser().parse(arguments, ros=False)
     try:
-        bags = _options.given_bags(options)
+        bags = _cli.given_bags(options)
         given = [name for name, _ in options.topics]
         if repeated := [name for name in given if given.count(name) > 1]:
             raise UserError(f'--topic can be given once for each name, got {repeated[0]} again')
-        picture = _picture(options, bags)
-        tables = [] if options.csv is None else _tables(options, bags)
-        # A bag that does not exist is reported when it is read.
-        beside = options.output is None and not bags[0].exists()
-        for path in (*([] if beside else [picture]), *tables):
-            try:
-                _check_writable(path, makes_directory=path in tables)
-            except OSError as error:
-                return _cli.cannot_write(PROGRAM, path, error)
-        runs: list[Run] = []
+        picture, tables = _picture(options, bags), _tables(options, bags)
+    except (UserError, ValueError, FileExistsError) as error:
+        return _output.complain(PROGRAM, error)
+    except OSError as error:
+        return _output.cannot_write(PROGRAM, error.filename, error)
+    runs: list[Run] = []
+    try:
         for bag in bags:
-            with busy(PROGRAM, f'reading {printable(bag, PATH_LIMIT)}'):
+            with _output.busy(PROGRAM, f'reading {bag}'):
                 runs.append(
                     read_run(
                         bag,
@@ -57,15 +52,15 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             # A run without odometry is reported before the others are read.
             timeline(runs[-1])
             for note in runs[-1].notes:
-                print(f'{PROGRAM}: {printable(bag, PATH_LIMIT)}: {note}', file=sys.stderr)
+                _output.note(PROGRAM, f'{bag}: {note}')
             if signals.count:
-                return _cli.interrupted(PROGRAM)
-        with explaining_no_matplotlib():
+                return _output.interrupted(PROGRAM)
+        with _output.explaining_no_matplotlib():
             return _write(runs, picture, tables, signals, replace=options.force)
     except ReadingInterruptedError:
-        return _cli.interrupted(PROGRAM)
+        return _output.interrupted(PROGRAM)
     except (BagError, UserError) as error:
-        return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
+        return _output.complain(PROGRAM, error)
 
 
 def _write(
@@ -79,27 +74,20 @@ def _write(
     ]
     for path, write in zip([picture, *tables], writers, strict=True):
         if signals.count:
-            return _cli.interrupted(PROGRAM)
+            return _output.interrupted(PROGRAM)
         try:
-            with busy(PROGRAM, f'writing {printable(path, PATH_LIMIT)}'):
+            with _output.busy(PROGRAM, f'writing {path}'):
                 write()
         except OSError as error:
-            return _cli.cannot_write(PROGRAM, path, error)
+            return _output.cannot_write(PROGRAM, path, error)
         try:
             print(printable(path, PATH_LIMIT))
         except BrokenPipeError:
             raise
         except OSError as error:
             # It is not buffered.
-            return _cli.complain(PROGRAM, f'{OUTPUT_ERROR}: {error.strerror}', _cli.FAILED)
-    return _cli.DONE
-
-
-def _check_writable(path: Path, *, makes_directory: bool) -> None:
-    """Raise OSError, before a picture is drawn, if a file cannot be created."""
-    parent = path.parent
-    if not path.exists():
-        check_directory(parent.parent if makes_directory and not parent.exists() else parent)
+            return _output.complain(PROGRAM, f'{OUTPUT_ERROR}: {error.strerror}', FAILED)
+    return DONE
 
 
 def _write_table(run: Run, path: Path, *, replace: bool) -> None:
@@ -111,50 +99,60 @@ def _picture(options: argparse.Namespace, bags: Sequence[Path]) -> Path:
     """Return the path of the picture, which by default is beside the first bag.
 
     Raises:
-        UserError: It exists, is a directory, or has another ending than a picture.
+        UserError: It is a directory.
+        ValueError, FileExistsError, OSError: As for `new_file`.
     """
     output = options.output
-    name = '_and_'.join(bag.resolve().name for bag in bags)
-    if options.namespace not in (None, '/'):
-        name += options.namespace.replace('/', '_')
-    path = bags[0].resolve().parent / f'{name}.png' if output is None else Path(output)
-    if output is not None and (output.endswith('/') or path.is_dir()):
+    if output is None:
+        name = '_and_'.join(bag.resolve().name for bag in bags)
+        if options.namespace not in (None, '/'):
+            name += options.namespace.replace('/', '_')
+        path = bags[0].resolve().parent / f'{name}.png'
+        # A bag that does not exist is reported when it is read.
+        if not bags[0].exists():
+            return path
+        output = str(path)
+    elif output.endswith('/') or Path(output).is_dir():
         raise UserError(
             f'the picture must be a file (.{", .".join(FORMATS)}), got a directory: {output!r}'
         )
-    if path.suffix.lower().removeprefix('.') not in FORMATS:
-        raise UserError(f'the picture must end in .{", .".join(FORMATS)}, got {output!r}')
-    return _checked(path, replace=options.force)
+    return new_file(output, FORMATS, 'picture', replace=options.force)
 
 
 def _tables(options: argparse.Namespace, bags: Sequence[Path]) -> list[Path]:
-    """Return the paths of the CSV files, one for each run.
+    """Return the paths of the CSV files, one for each run. Their directory may still be missing.
 
     Raises:
-        UserError: One of them exists, or `output` is neither a CSV file nor a directory.
+        UserError: `--csv` is neither a CSV file nor a directory.
+        FileExistsError, OSError: As for `new_file`.
     """
     output = options.csv
+    if output is None:
+        return []
     path = Path(output)
     if path.is_dir() or output.endswith('/') or not path.suffix:
         if path.exists() and not path.is_dir():
             raise UserError(f'{path} exists already; a CSV file ends in .csv')
-        labels = (name.replace('/', '_') for name in names(bags))
-        return [_checked(path / f'{label}.csv', replace=options.force) for label in labels]
-    if path.suffix.lower() != '.csv':
+        tables = [path / f'{label.replace("/", "_")}.csv' for label in names(bags)]
+    elif path.suffix.lower() != '.csv':
         raise UserError(
             f'--csv must be a file that ends in .csv or a directory, got {output!r} (a directory exists '
             'already, has a name without an ending, or is given with / at its end)'
         )
-    if len(bags) > 1:
+    elif len(bags) > 1:
         raise UserError(f'--csv must be a directory for {len(bags)} runs, got {output!r}')
-    return [_checked(path, replace=options.force)]
-
-
-def _checked(path: Path, *, replace: bool) -> Path:
-    """Return a path, unless something is there that is not to be replaced."""
-    if (path.exists() or path.is_symlink()) and not (replace and path.is_file()):
-        raise UserError(f'{path} exists already; {NOT_OVERWRITTEN}')
-    return path
+    else:
+        tables = [path]
+    for table in tables:
+        if table.parent.exists():
+            new_file(str(table), ('csv',), 'table', replace=options.force)
+            continue
+        try:
+            check_directory(table.parent.parent)
+        except OSError as error:
+            error.filename = str(table)
+            raise
+    return tables
 
 
 def _topic(text: str) -> tuple[str, str]:
@@ -175,11 +173,9 @@ def _parser() -> _cli.Parser:
         'Exit code 0: drawn; 1: a file cannot be written; 2: wrong arguments, or a bag cannot be read; '
         '130: interrupted.',
     )
-    _options.add_bags(parser)
-    _options.add_output(
-        parser,
-        'FILE',
-        f'picture to write, .{", .".join(FORMATS)} (default: BAG.png beside the bag)',
+    parser.add_bags()
+    parser.add_output(
+        'FILE', f'picture to write, .{", .".join(FORMATS)} (default: BAG.png beside the bag)'
     )
     parser.add_argument(
         '--csv',
@@ -187,8 +183,8 @@ def _parser() -> _cli.Parser:
         help='also write the values over time: to FILE.csv, or to BAG.csv for each bag in a directory. '
         f'Times are exact, values are rounded to {DECIMALS} decimal places (default: none)',
     )
-    _options.add_force(parser, 'the picture and the tables')
-    _options.add_namespace(parser)
+    parser.add_force('the picture and the tables')
+    parser.add_namespace()
     parser.add_argument(
         '--topic',
         dest='topics',

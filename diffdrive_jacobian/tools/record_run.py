@@ -13,9 +13,9 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.recording.selection import RUN_TOPICS, Selection
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools import _cli, _options
-from diffdrive_jacobian.tools._messages import Waiting, busy, counted, describe_bag
-from diffdrive_jacobian.tools._startup import long_lived
+from diffdrive_jacobian.tools import _cli, _output
+from diffdrive_jacobian.tools._output import counted, describe_bag
+from diffdrive_jacobian.tools.entry_points import DONE, FAILED, long_lived
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.recording.record import Status
@@ -31,11 +31,7 @@ class StatusLine:
     """A line about the state of the recording."""
 
     def __init__(self, hint: str = '') -> None:
-        """Start without messages.
-
-        Args:
-            hint: What follows a list of topics without a publisher.
-        """
+        """Start without messages. The hint follows a list of topics without a publisher."""
         self.missing = ''
         """What is missing, as long as no topic is recorded."""
         self.never_published: tuple[str, ...] = ()
@@ -44,7 +40,7 @@ class StatusLine:
         self._terminal = sys.stdout.isatty()
         self._shown = 0.0
         self._messages = 0
-        self._waiting = Waiting()
+        self._waiting = _output.Waiting()
 
     def show(self, status: Status) -> None:
         """Print the status if it is due."""
@@ -88,13 +84,12 @@ class StatusLine:
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
-    own, ros = _cli.split_arguments(arguments)
     parser = _parser()
-    options = _cli.parse(parser, own)
-    _cli.refuse_without(parser, options, '--force', '--output')
-    for option in ('--regex', 'topics'):
-        if options.all and getattr(options, option.lstrip('-')):
-            parser.error(f'{option.replace("topics", "TOPIC")} has no effect with --all')
+    options = parser.parse(arguments)
+    parser.refuse_without(options, '--force', '--output')
+    parser.refuse_with(options, '--regex', '--all')
+    if options.all and options.topics:
+        parser.error('TOPIC has no effect with --all')
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.recording.record import open_recording, record
@@ -109,7 +104,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     try:
         recording = open_recording('run', options.output, options.storage, replace=options.force)
     except OSError as error:
-        return _cli.complain(PROGRAM, error)
+        return _output.complain(PROGRAM, error)
     bag = recording.bag
     print(f'recording to {printable(bag, PATH_LIMIT)}; Ctrl-C ends it', flush=True)
     # A word that is meant as the name of the bag is read as that of a topic.
@@ -121,29 +116,28 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 recording,
                 selection,
                 max_duration=options.max_duration,
-                ros_arguments=ros,
+                ros_arguments=options.ros,
                 signals=signals,
                 on_status=line.show,
                 on_wait=line.wait,
-                on_end=lambda: ending.enter_context(busy(PROGRAM, f'writing {bag}')),
+                on_end=lambda: ending.enter_context(_output.busy(PROGRAM, f'writing {bag}')),
             )
         finally:
             ending.close()
             line.end()
     except UserError as error:
-        return _cli.complain(PROGRAM, error)
+        return _output.complain(PROGRAM, error)
     except RecordingError as error:
         if error.summary is not None:
             print(describe_bag(bag, error.summary, 'incomplete'))
-        print(f'{PROGRAM}: error: {error}', file=sys.stderr)
-        return _cli.FAILED
+        return _output.complain(PROGRAM, error, FAILED)
     print(describe_bag(bag, summary))
     if topics and not summary.messages:
         reason = line.missing or f'no message was received on {", ".join(topics)}'
-        return _cli.complain(PROGRAM, reason, _cli.FAILED)
+        return _output.complain(PROGRAM, reason, FAILED)
     if topics and line.never_published:
-        print(f'{PROGRAM}: warning: no publisher: {_listed(line.never_published)}', file=sys.stderr)
-    return _cli.DONE
+        _output.note(PROGRAM, f'warning: no publisher: {_listed(line.never_published)}')
+    return DONE
 
 
 def describe_missing(status: Status, hint: str = '') -> str:
@@ -192,11 +186,9 @@ def _parser() -> _cli.Parser:
         nargs='*',
         help=f'topics to record (default: those of a run: {", ".join(RUN_TOPICS)})',
     )
-    _options.add_output(
-        parser, 'BAG', 'directory of the bag (default: run_DATE-TIME)', kind=_options.bag_folder
-    )
-    _options.add_force(parser, 'BAG, at the end of the recording')
-    _options.add_storage(parser, default='mcap')
+    parser.add_output('BAG', 'directory of the bag (default: run_DATE-TIME)', kind=_cli.bag_folder)
+    parser.add_force('BAG, at the end of the recording')
+    parser.add_storage(default='mcap')
     parser.add_argument('-a', '--all', action='store_true', help='record every topic that is not hidden')
     parser.add_argument(
         '-e',
@@ -204,7 +196,7 @@ def _parser() -> _cli.Parser:
         type=_pattern,
         help='record the topics in whose names this regular expression is found',
     )
-    _options.add_value(
-        parser, '--max-duration', 'SECONDS', 'end the recording after this time (s) (default: never)'
+    parser.add_value(
+        '--max-duration', 'SECONDS', 'end the recording after this time (s) (default: never)'
     )
     return parser

@@ -17,9 +17,9 @@ from diffdrive_jacobian.bags.recovery import (
     recover,
 )
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools import _cli, _options
-from diffdrive_jacobian.tools._messages import busy, describe_bag
+from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.tools import _cli, _output
+from diffdrive_jacobian.tools.entry_points import DONE, FAILED, USER_ERROR
 
 PROGRAM = 'recover_run'
 UNCHECKED = 3
@@ -32,38 +32,36 @@ MAX_LINE = 400
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
-    options = _parser().parse_args(arguments)
+    options = _parser().parse(arguments, ros=False)
     try:
-        with busy(PROGRAM, f'reading {printable(options.bag, PATH_LIMIT)}'):
+        with _output.busy(PROGRAM, f'reading {options.bag}'):
             recovery = recover(
                 options.bag,
                 options.output,
                 options.storage,
                 replace=options.force,
-                interrupted=lambda: bool(signals.count),
+                interrupted=lambda: signals.count > 0,
             )
     except RecoveryInterruptedError:
-        return _cli.interrupted(PROGRAM, 'no bag was written')
+        return _output.interrupted(PROGRAM, 'no bag was written')
     except NothingToSaveError as error:
         reason, *losses = error.args
-        print(f'{PROGRAM}: {printable(reason, PATH_LIMIT)}', *_listed(losses), sep='\n', file=sys.stderr)
-        return UNCHECKED if isinstance(error, UncheckedError) else _cli.FAILED
+        _output.note(PROGRAM, reason)
+        print(*_listed(losses), sep='\n', end='\n' if losses else '', file=sys.stderr)
+        return UNCHECKED if isinstance(error, UncheckedError) else FAILED
     except (NotABagError, FileExistsError) as error:
-        return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
+        return _output.complain(PROGRAM, error)
     except (OSError, sqlite3.Error) as error:
-        print(f'{PROGRAM}: error: no bag was written: {printable(error, PATH_LIMIT)}', file=sys.stderr)
-        return (
-            _cli.USER_ERROR
-            if isinstance(error, PermissionError | FileNotFoundError | NotADirectoryError)
-            else _cli.FAILED
-        )
+        wrong = isinstance(error, PermissionError | FileNotFoundError | NotADirectoryError)
+        code = USER_ERROR if wrong else FAILED
+        return _output.complain(PROGRAM, f'no bag was written: {error}', code)
     print(report(recovery))
-    return _cli.FAILED if recovery.topics_left_out or recovery.records_left_out else _cli.DONE
+    return FAILED if recovery.topics_left_out or recovery.records_left_out else DONE
 
 
 def report(recovery: Recovery) -> str:
     """Return a description of a recovery, of several lines."""
-    lines = [describe_bag(recovery.bag, recovery.summary, 'written')]
+    lines = [_output.describe_bag(recovery.bag, recovery.summary, 'written')]
     if recovery.damaged:
         lines.append(f'damaged: {recovery.damaged}')
     lost = _listed([*recovery.lost, *recovery.lost_before], 'lost: ')
@@ -94,17 +92,15 @@ def _parser() -> _cli.Parser:
         '3: nothing to recover (nothing was found missing, but not all could be checked, for want of '
         'checksums or counts); 130: interrupted.',
     )
-    _options.add_bag(
-        parser,
+    parser.add_bag(
         'directory of a bag, a file of it (.mcap, .db3), a journal of record_run, or the bag that '
-        'the journal belongs to',
+        'the journal belongs to'
     )
-    _options.add_output(
-        parser,
+    parser.add_output(
         'NEW',
         f'directory to write (default: BAG{RECOVERED}, for a journal the bag it belongs to)',
         kind=Path,
     )
-    _options.add_force(parser, 'NEW, which must not be BAG')
-    _options.add_storage(parser)
+    parser.add_force('NEW, which must not be BAG')
+    parser.add_storage()
     return parser

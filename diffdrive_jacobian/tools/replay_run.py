@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli, _options
-from diffdrive_jacobian.tools._messages import Waiting
-from diffdrive_jacobian.tools._startup import long_lived
+from diffdrive_jacobian.tools import _cli, _output
+from diffdrive_jacobian.tools.entry_points import DONE, FAILED, INTERRUPTED, long_lived
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.recording import ReplayResult
@@ -25,23 +24,42 @@ MATCH_PATIENCE = 5.0
 """Longest wait for subscriptions without -w (s): an older participant is announced every 3 s."""
 
 
-def _replay(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
+def main(arguments: Sequence[str], signals: Signals) -> int:
+    """Run the tool; return the exit code."""
+    own, ros = _cli.split_arguments(arguments)
+    rest = [word for word in own if not (VERIFY.startswith(word) and word.startswith('--v'))]
+    if len(rest) < len(own):
+        # Slow to import.
+        from diffdrive_jacobian.tools import verify_run
+
+        return verify_run.run_as_option(PROGRAM, VERIFY, [*rest, *ros], signals)
+    parser = _parser()
+    options = parser.parse(arguments)
+    if options.timeout is not None and options.readers is None:
+        parser.error('--timeout needs -w: it is the longest wait for the subscriptions of -w')
+    parser.refuse_with(options, '--namespace', '--topics')
+    parser.refuse_with(options, '--wait-for-all-acked', '--loop')
+    if options.start_paused and not (sys.stdin and sys.stdin.isatty()):
+        parser.error('--start-paused needs a terminal: Enter resumes')
+    # Not above: --help needs no ROS.
+    from diffdrive_jacobian.bags.bag_reader import BagError
+
     with long_lived(), signals.ending_at_once():
         from diffdrive_jacobian.recording import COMMANDS, GOALS, NothingToPlayError, Playback, replay
 
-    playback = Playback(
-        names=None if options.all_topics else GOALS if options.goals else COMMANDS,
-        topics=tuple(options.topics or ()),
-        namespace=options.namespace,
-        remap=dict(options.remap),
-        rate=options.rate,
-        start_offset=options.start_offset,
-        loop=options.loop,
-        clock=options.clock,
-        paused=options.start_paused,
-    )
     acked = options.wait_for_all_acked
     try:
+        playback = Playback(
+            names=None if options.all_topics else GOALS if options.goals else COMMANDS,
+            topics=tuple(options.topics or ()),
+            namespace=options.namespace,
+            remap=dict(options.remap),
+            rate=options.rate,
+            start_offset=options.start_offset,
+            loop=options.loop,
+            clock=options.clock,
+            paused=options.start_paused,
+        )
         result = replay(
             options.bag,
             playback,
@@ -49,12 +67,14 @@ def _replay(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -
             readers=options.readers,
             timeout=math.inf if options.timeout is None else options.timeout,
             acknowledgement_timeout=None if acked is None else acked / 1000.0,
-            ros_arguments=ros,
+            ros_arguments=options.ros,
             signals=signals,
             progress=_Progress(),
         )
     except NothingToPlayError as error:
-        return _cli.complain(PROGRAM, error, _cli.FAILED)
+        return _output.complain(PROGRAM, error, FAILED)
+    except (UserError, BagError, ParameterError) as error:
+        return _output.complain(PROGRAM, error)
     return _report(result, options)
 
 
@@ -62,12 +82,9 @@ class _Progress:
     """Prints the progress of a replay, and pauses it by Enter."""
 
     def __init__(self) -> None:
-        # Slow to import.
-        from diffdrive_jacobian.tools._progress import Bar
-
-        self._bar = Bar(stays=True)
+        self._bar = _output.Bar(stays=True)
         self._seconds = 0.0
-        self._waiting = Waiting()
+        self._waiting = _output.Waiting()
 
     def waiting(self, reason: str) -> None:
         self._waiting.show(reason)
@@ -89,7 +106,7 @@ class _Progress:
     def ended(self) -> None:
         self._bar.close()
         # The acknowledgements come next.
-        self._waiting = Waiting()
+        self._waiting = _output.Waiting()
 
 
 def _report(result: ReplayResult, options: argparse.Namespace) -> int:
@@ -100,46 +117,20 @@ def _report(result: ReplayResult, options: argparse.Namespace) -> int:
         counts = describe_too_few(result.too_few, options.readers)
         if result.interrupted:
             print(f'interrupted: nothing was played, {counts}')
-            return _cli.INTERRUPTED
+            return INTERRUPTED
         print(f'nothing was played: {counts} after --timeout {options.timeout:g} s')
-        return _cli.FAILED
+        return FAILED
     print(f'{result.messages} messages played')
     if result.missing:
-        print(f'{PROGRAM}: warning: {result.missing} messages are missing in the bag', file=sys.stderr)
+        _output.note(PROGRAM, f'warning: {result.missing} messages are missing in the bag')
     if result.interrupted:
-        return _cli.INTERRUPTED
+        return INTERRUPTED
     if result.unacknowledged:
         topics = ', '.join(result.unacknowledged)
         seconds = options.wait_for_all_acked / 1000.0
         reason = f'not all subscriptions to {topics} have acknowledged all messages within {seconds:g} s'
-        return _cli.complain(PROGRAM, reason, _cli.FAILED)
-    return _cli.DONE if result.played else _cli.FAILED
-
-
-def main(arguments: Sequence[str], signals: Signals) -> int:
-    """Run the tool; return the exit code."""
-    own, ros = _cli.split_arguments(arguments)
-    if any(VERIFY.startswith(word) and word.startswith('--v') for word in own):
-        # Slow to import.
-        from diffdrive_jacobian.tools import verify_run
-
-        rest = [word for word in own if not (VERIFY.startswith(word) and word.startswith('--v'))]
-        return verify_run.run_as_option(PROGRAM, VERIFY, [*rest, *ros], signals)
-    parser = _parser()
-    options = _cli.parse(parser, own)
-    if options.timeout is not None and options.readers is None:
-        parser.error('--timeout needs -w: it is the longest wait for the subscriptions of -w')
-    _cli.refuse_with(parser, options, '--namespace', '--topics')
-    _cli.refuse_with(parser, options, '--wait-for-all-acked', '--loop')
-    if options.start_paused and not (sys.stdin and sys.stdin.isatty()):
-        parser.error('--start-paused needs a terminal: Enter resumes')
-    # Not above: --help needs no ROS.
-    from diffdrive_jacobian.bags.bag_reader import BagError
-
-    try:
-        return _replay(options, ros, signals)
-    except (UserError, BagError, ParameterError) as error:
-        return _cli.complain(PROGRAM, error)
+        return _output.complain(PROGRAM, reason, FAILED)
+    return DONE if result.played else FAILED
 
 
 def _remapping(text: str) -> tuple[str, str]:
@@ -157,7 +148,7 @@ def _parser() -> _cli.Parser:
         'topics. On a terminal, Enter pauses and resumes. Exit code 0: played; 1: not played to the '
         'end, or nothing to play; 2: wrong arguments or no bag; 130: interrupted.',
     )
-    _options.add_bag(parser)
+    parser.add_bag()
     what = parser.add_mutually_exclusive_group()
     what.add_argument('--goals', action='store_true', help='play the goals of the controller')
     what.add_argument('--all-topics', action='store_true', help='play all topics')
@@ -168,16 +159,15 @@ def _parser() -> _cli.Parser:
         help='play these topics; the namespace can be left out where only one robot has the topic',
     )
     what.add_argument(VERIFY, action='store_true', help='run verify_run instead, with its options')
-    _options.add_namespace(parser)
-    _options.add_value(parser, '-r --rate', 'RATE', 'factor on the speed', default=1.0)
+    parser.add_namespace()
+    parser.add_value('-r --rate', 'RATE', 'factor on the speed', default=1.0)
     parser.add_argument('-l', '--loop', action='store_true', help='start again at the end of the bag')
-    _options.add_value(
-        parser,
+    parser.add_value(
         '--start-offset',
         'SECONDS',
         'start this long after the beginning of the bag (s)',
         default=0.0,
-        kind=_options.not_negative,
+        kind=_cli.not_negative,
     )
     parser.add_argument(
         '-m',
@@ -193,24 +183,19 @@ def _parser() -> _cli.Parser:
         '--clock',
         nargs='?',
         const=40.0,
-        type=_options.positive,
+        type=_cli.positive,
         metavar='HZ',
         help='publish the time of the bag on /clock at this rate (Hz) (default: 40.0 if HZ is left '
         'out, not at all without the option)',
     )
     parser.add_argument('-p', '--start-paused', action='store_true', help='start in the paused state')
-    _options.add_wait_matching(
-        parser, 'each topic has', f'those that are discovered within {MATCH_PATIENCE:g} s'
-    )
-    _options.add_timeout(
-        parser, 'with -w: give up after this time (s) and play nothing (default: never)'
-    )
-    _options.add_value(
-        parser,
+    parser.add_wait_matching('each topic has', f'those that are discovered within {MATCH_PATIENCE:g} s')
+    parser.add_timeout('with -w: give up after this time (s) and play nothing (default: never)')
+    parser.add_value(
         '--wait-for-all-acked',
         'MS',
         'at the end wait up to this time (ms) until all reliable subscriptions have acknowledged '
         'all messages, 0: no limit; exit code 1 if they have not (default: do not wait)',
-        kind=_options.not_negative,
+        kind=_cli.not_negative,
     )
     return parser

@@ -13,8 +13,8 @@ from typing import NamedTuple
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, specifications
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli, _options
-from diffdrive_jacobian.tools._startup import long_lived
+from diffdrive_jacobian.tools import _cli, _output
+from diffdrive_jacobian.tools.entry_points import DONE, long_lived
 
 
 class Program(NamedTuple):
@@ -68,9 +68,8 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
         try:
             parameters = parameters_of(name).extended(_given(ros))
         except ParameterError as error:
-            return _cli.complain(name, error)
-        parser = _parser(name, program, parameters)
-        ros = _options.with_params_file(ros, _cli.parse(parser, own, parameters=[parameters], hint=hint))
+            return _output.complain(name, error)
+        ros = _parser(name, program, parameters).parse(arguments, parameters=[parameters], hint=hint).ros
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS. Only the node that runs: each takes time to import.
         from diffdrive_jacobian.ros.runner import ros_context, running
@@ -83,11 +82,11 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
         ):
             with long_lived():
                 node = runner.add(lambda: create(context=context))
-            _options.warn_of_unused_files(name, ros, [node.get_fully_qualified_name()])
+            _cli.warn_of_unused_files(name, ros, [node.get_fully_qualified_name()])
             runner.spin(lambda: False, signals=signals)
     except UserError as error:
-        return _cli.complain(name, error)
-    return _cli.DONE
+        return _output.complain(name, error)
+    return DONE
 
 
 def _given(ros: Sequence[str]) -> dict[str, str]:
@@ -97,11 +96,7 @@ def _given(ros: Sequence[str]) -> dict[str, str]:
 
 
 def parameters_of(name: str) -> type[NodeParameters]:
-    """Return the parameters of a node. Neither ROS nor the parameters of other nodes are imported.
-
-    Args:
-        name: One of NODES.
-    """
+    """Return the parameters of one of NODES, without an import of ROS or of those of other nodes."""
     module = importlib.import_module(f'diffdrive_jacobian.parameters.{name}')
     parameters: type[NodeParameters] = getattr(module, f'{NODES[name].class_name}Parameters')
     return parameters
@@ -116,20 +111,17 @@ def _parser(name: str, program: Program, parameters: type[NodeParameters]) -> _c
         epilog=_description(parameters),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    _options.add_params_file(parser)
+    parser.add_params_file()
     return parser
 
 
 def _description(parameters: type[NodeParameters]) -> str:
     """Return the description of all parameters."""
     defaults = {field.name: field.default for field in fields(parameters)}
-    lines = ['parameters:']
+    lines, indent = ['parameters:'], ' ' * 6
     for ros_name, (field, specification) in specifications(parameters).items():
-        text = specification.description
-        text += f' Must be {specification.allowed}.' if specification.allowed else ''
-        text += f' (default: {defaults[field]})'
-        lines += [
-            f'  {ros_name}',
-            *textwrap.wrap(text, 90, initial_indent='      ', subsequent_indent='      '),
-        ]
+        allowed = f' Must be {specification.allowed}.' if specification.allowed else ''
+        text = f'{specification.description}{allowed} (default: {defaults[field]})'
+        wrapped = textwrap.wrap(text, 90, initial_indent=indent, subsequent_indent=indent)
+        lines += [f'  {ros_name}', *wrapped]
     return '\n'.join(lines)

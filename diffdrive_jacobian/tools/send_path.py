@@ -5,35 +5,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli, _options, _sending
-from diffdrive_jacobian.tools._startup import long_lived
+from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools.entry_points import long_lived
+from diffdrive_jacobian.tools.send_goal import add_options, send
 
 PROGRAM = 'send_path'
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
-    own, ros = _cli.split_arguments(arguments)
     parser = _parser()
-    options = _cli.parse(parser, own)
-    _cli.refuse_with(parser, options, '--timeout', '--no-wait')
-    path = _options.given_path(parser, options)
+    options = parser.parse(arguments)
+    parser.refuse_with(options, '--timeout', '--no-wait')
+    path = parser.given_path(options)
     if options.speed is not None:
         path = path.timed(options.speed)
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.nodes.remote_goal import send_path
 
-    return _sending.send(
-        PROGRAM,
-        f'path {options.path}',
-        send_path,
-        options,
-        ros,
-        signals,
-        path=path,
-        relative=_options.is_relative(options.path) and not options.frame,
-    )
+    relative = _cli.is_relative(options.path) and not options.frame
+    what = f'path {options.path}'
+    return send(PROGRAM, what, send_path, options, signals, path=path, relative=relative)
 
 
 def _parser() -> _cli.Parser:
@@ -44,12 +37,11 @@ def _parser() -> _cli.Parser:
         'it. A shape begins at the robot, unless a frame is given. Exit code 0: arrived; 1: not '
         'arrived; 2: wrong arguments; 130: interrupted.',
     )
-    _options.add_path(parser, 'path')
-    _options.add_value(
-        parser,
+    parser.add_path('path')
+    parser.add_value(
         '--speed',
         'M/S',
         'send a trajectory with this speed: poses with stamps (m/s) (default: a path without times)',
     )
-    _sending.add_options(parser, 'path', 'path')
+    add_options(parser, 'path', 'path')
     return parser

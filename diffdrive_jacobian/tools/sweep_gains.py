@@ -6,6 +6,7 @@ import argparse
 import importlib
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,8 @@ from diffdrive_jacobian.simulation.gain_sweep import (
     sweep,
     sweep_table,
 )
-from diffdrive_jacobian.tools import _cli, _options
-from diffdrive_jacobian.tools._messages import busy, explaining_no_matplotlib
+from diffdrive_jacobian.tools import _cli, _output
+from diffdrive_jacobian.tools.entry_points import DONE
 
 PROGRAM = 'sweep_gains'
 
@@ -38,38 +39,81 @@ class SweepInterruptedError(DiffdriveError):
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
-    own, ros = _cli.split_arguments(arguments)
     try:
-        parser = _parser(_controller(own))
+        parser = _parser(_controller(arguments))
     except (ControllerError, argparse.ArgumentError) as error:
-        return _cli.complain(PROGRAM, error)
-    options = _cli.parse(parser, [*own, *ros], ros=False)
-    _cli.refuse_without(parser, options, '--force', '--output', '--csv')
+        return _output.complain(PROGRAM, error)
+    options = parser.parse(arguments, ros=False)
+    parser.refuse_without(options, '--force', '--output', '--csv')
     try:
         # Before the sweep, which takes a while.
-        picture, numbers = _files(options)
+        picture, table = _files(options)
         _check(signals)
         if picture is not None:
             # Slow.
-            with explaining_no_matplotlib('; the table alone, --csv FILE, does not need it'):
+            with _output.explaining_no_matplotlib('; the table alone, --csv FILE, does not need it'):
                 importlib.import_module('matplotlib.figure')
         swept = _sweep(options, signals)
-        with busy(PROGRAM, 'drawing'):
+        with _output.busy(PROGRAM, 'drawing'):
             drawn = b'' if picture is None else sweep_figure.draw(swept, extension(picture))
-        rows = b'' if numbers is None else sweep_table(swept).encode()
+        rows = b'' if table is None else sweep_table(swept).encode()
         _check(signals)
         if options.output is None and options.csv is None:
             # Other processes that started in the same second may have taken the names meanwhile.
-            picture, numbers = _files(options)
+            picture, table = _files(options)
     except SweepInterruptedError:
-        return _cli.interrupted(PROGRAM, 'nothing was written')
+        return _output.interrupted(PROGRAM, 'nothing was written')
     except (ValueError, UserError, FileExistsError) as error:
-        return _cli.complain(PROGRAM, error)
+        return _output.complain(PROGRAM, error)
     except OSError as error:
-        return _cli.cannot_write(PROGRAM, error.filename, error)
-    code = _write([(numbers, rows), (picture, drawn)], replace=options.force)
-    print(describe_sweep(swept))
+        return _output.cannot_write(PROGRAM, error.filename, error)
+    code, written = DONE, []
+    for path, content in ((table, rows), (picture, drawn)):
+        if path is None:
+            continue
+        try:
+            create(path, content, replace=options.force)
+            written.append(path)
+        except OSError as error:
+            # The other file is still written.
+            code = _output.cannot_write(PROGRAM, path, error)
+    # Only now: the reader of the output may go away.
+    print(*written, describe_sweep(swept), sep='\n')
     return code
+
+
+def _check(signals: Signals) -> None:
+    """Raise SweepInterruptedError if a signal was caught."""
+    if signals.count:
+        raise SweepInterruptedError
+
+
+def _controller(arguments: Sequence[str]) -> Controller:
+    """Return the controller that is chosen on the command line: its gains are options.
+
+    Raises:
+        ControllerError: There is none of that name, or it cannot be loaded.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument('--controller', nargs='?', default=SweepSetup().controller)
+    name = parser.parse_known_args(arguments)[0].controller
+    return CONTROLLERS.find(name or '')
+
+
+def _files(options: argparse.Namespace) -> tuple[Path | None, Path | None]:
+    """Return the files to write, the picture and the table. None: it is not written.
+
+    Raises:
+        ValueError, FileExistsError, OSError: As for `new_file`.
+    """
+    output, csv, force = options.output, options.csv, options.force
+    if output is None and csv is None:
+        stem = free_stem('sweep', ('png', 'csv'))
+        output, csv = f'{stem}.png', f'{stem}.csv'
+    return (
+        None if output is None else new_file(output, FORMATS, 'picture', replace=force),
+        None if csv is None else new_file(csv, ('csv',), 'table', replace=force),
+    )
 
 
 def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
@@ -80,9 +124,14 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
         UserError: The parameter file is invalid.
         SweepInterruptedError: A signal was caught.
     """
+    gains: dict[str, float | tuple[float, float]] = {}
+    for gain in CONTROLLERS.find(options.controller).gains:
+        values = getattr(options, f'gain_{gain.name}')
+        if values is not None:
+            gains[gain.name] = values[0] if len(values) == 1 else tuple(values)
     setup = SweepSetup(
         controller=options.controller,
-        gains=_gains(options),
+        gains=gains,
         grid=options.grid,
         starts=options.starts,
         distance=options.distance,
@@ -92,11 +141,8 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
         robot=_robot(options),
     )
     _check(signals)
-    # Slow to import.
-    from diffdrive_jacobian.tools._progress import Bar
-
     started = time.monotonic()
-    with Bar() as bar:
+    with closing(_output.Bar()) as bar:
 
         def progress(done: int) -> None:
             _check(signals)
@@ -104,34 +150,6 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
             bar.show('sweeping', done / setup.loops, f'{done} of {setup.loops}, {seconds:.0f} s')
 
         return sweep(setup, progress)
-
-
-def _controller(own: Sequence[str]) -> Controller:
-    """Return the controller that is chosen on the command line: its gains are options.
-
-    Raises:
-        ControllerError: There is none of that name, or it cannot be loaded.
-    """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument('--controller', nargs='?', default=SweepSetup().controller)
-    name = parser.parse_known_args(own)[0].controller
-    return CONTROLLERS.find(name or '')
-
-
-def _gains(options: argparse.Namespace) -> dict[str, float | tuple[float, float]]:
-    """Return the gains that are given: a value, or a range."""
-    found: dict[str, float | tuple[float, float]] = {}
-    for gain in CONTROLLERS.find(options.controller).gains:
-        values = getattr(options, f'gain_{gain.name}')
-        if values is not None:
-            found[gain.name] = values[0] if len(values) == 1 else tuple(values)
-    return found
-
-
-def _check(signals: Signals) -> None:
-    """Raise SweepInterruptedError if a signal was caught."""
-    if signals.count:
-        raise SweepInterruptedError
 
 
 def _robot(options: argparse.Namespace) -> RobotModel:
@@ -150,47 +168,8 @@ def _robot(options: argparse.Namespace) -> RobotModel:
     for name, limit in (('linear.x', options.max_velocity), ('angular.z', options.max_yaw_rate)):
         if limit is not None:
             values |= {f'{name}.max_velocity': limit, f'{name}.min_velocity': -limit}
-    values |= _options.following_parameters(options)
+    values |= _cli.following_parameters(options)
     return from_ros(VirtualRobotParameters, values).model()
-
-
-def _files(options: argparse.Namespace) -> tuple[Path | None, Path | None]:
-    """Return the files to write, the picture and the table. None: it is not written.
-
-    Raises:
-        ValueError: A file name has the wrong extension.
-        FileExistsError: A file exists.
-        OSError: A file cannot be written.
-    """
-    output, csv = options.output, options.csv
-    if output is None and csv is None:
-        stem = free_stem('sweep', ('png', 'csv'))
-        output, csv = f'{stem}.png', f'{stem}.csv'
-    return (
-        None if output is None else new_file(output, FORMATS, 'picture', replace=options.force),
-        None if csv is None else new_file(csv, ('csv',), 'table', replace=options.force),
-    )
-
-
-def _write(contents: Sequence[tuple[Path | None, bytes]], *, replace: bool) -> int:
-    """Write files and print their names; return the exit code.
-
-    A file that cannot be written does not prevent the others from being written.
-    """
-    code = _cli.DONE
-    written = []
-    for path, content in contents:
-        if path is None:
-            continue
-        try:
-            create(path, content, replace=replace)
-            written.append(path)
-        except OSError as error:
-            code = _cli.cannot_write(PROGRAM, path, error)
-    # Only now: the reader of the output may go away.
-    for path in written:
-        print(path)
-    return code
 
 
 def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
@@ -205,64 +184,38 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
         'written; 2: wrong arguments; 130: interrupted, and nothing was written.',
     )
     usual = SweepSetup()
-    _options.add_value(
-        parser,
-        '--grid',
-        'N',
-        'number of values of each gain',
-        default=usual.grid,
-        kind=_options.integer_from(2, MAX_LOOPS),
-    )
-    _options.add_value(
-        parser,
-        '--starts',
-        'N',
-        'number of start poses, evenly spaced around the goal, with headings in all directions',
-        default=usual.starts,
-        kind=_options.integer_from(1, MAX_LOOPS),
-    )
-    _options.add_value(
-        parser,
-        '--distance',
-        'M',
-        'distance of the start poses from the goal (m)',
-        default=usual.distance,
-    )
-    _options.add_controller(
-        parser,
-        CONTROLLERS,
-        'controller, whose gains are options, too: %(choices)s',
-        default=usual.controller,
-    )
-    _options.add_value(parser, '--rate', 'HZ', 'control rate (Hz)', default=usual.rate)
-    _options.add_value(
-        parser, '--duration', 'S', 'longest duration of a closed loop (s)', default=usual.duration
-    )
-    _options.add_value(
-        parser,
-        '--tolerance',
-        'M',
-        'distance that counts as arrived (m)',
-        default=usual.tolerance,
-        kind=_options.tolerance,
-    )
-    _options.add_value(parser, '--max-velocity', 'V', 'limit of the speed (m/s) (default: no limit)')
-    _options.add_value(
-        parser, '--max-yaw-rate', 'W', 'limit of the yaw rate (rad/s) (default: no limit)'
-    )
-    _options.add_following(parser)
-    _options.add_params_file(
-        parser,
-        'parameter file (YAML) with the limits and wheels of virtual_robot, as in config/ '
-        '(default: the defaults of virtual_robot)',
-    )
-    default = 'sweep_DATE-TIME.{}, unless {} is given'
-    _options.add_output(
-        parser, 'FILE', f'picture, .{", .".join(FORMATS)} (default: {default.format("png", "--csv")})'
-    )
-    _options.add_force(parser, 'the picture and the table')
+    text = 'number of values of each gain'
+    parser.add_value('--grid', 'N', text, default=usual.grid, kind=_cli.integer_from(2, MAX_LOOPS))
+    text = 'number of start poses, evenly spaced around the goal, with headings in all directions'
+    parser.add_value('--starts', 'N', text, default=usual.starts, kind=_cli.integer_from(1, MAX_LOOPS))
+    text = 'distance of the start poses from the goal (m)'
+    parser.add_value('--distance', 'M', text, default=usual.distance)
     parser.add_argument(
-        '--csv', metavar='FILE', help=f'table, .csv (default: {default.format("csv", "-o")})'
+        '--controller',
+        choices=CONTROLLERS,
+        metavar='NAME',
+        default=usual.controller,
+        help='controller, whose gains are options, too: %(choices)s (default: %(default)s)',
+    )
+    parser.add_value('--rate', 'HZ', 'control rate (Hz)', default=usual.rate)
+    text = 'longest duration of a closed loop (s)'
+    parser.add_value('--duration', 'S', text, default=usual.duration)
+    text = 'distance that counts as arrived (m)'
+    parser.add_value('--tolerance', 'M', text, default=usual.tolerance, kind=_cli.tolerance)
+    parser.add_value('--max-velocity', 'V', 'limit of the speed (m/s) (default: no limit)')
+    parser.add_value('--max-yaw-rate', 'W', 'limit of the yaw rate (rad/s) (default: no limit)')
+    parser.add_following()
+    parser.add_params_file(
+        'parameter file (YAML) with the limits and wheels of virtual_robot, as in config/ '
+        '(default: the defaults of virtual_robot)'
+    )
+    unless = 'sweep_DATE-TIME.{}, unless {} is given'
+    parser.add_output(
+        'FILE', f'picture, .{", .".join(FORMATS)} (default: {unless.format("png", "--csv")})'
+    )
+    parser.add_force('the picture and the table')
+    parser.add_argument(
+        '--csv', metavar='FILE', help=f'table, .csv (default: {unless.format("csv", "-o")})'
     )
     for gain in controller.gains:
         unit = f' ({gain.unit})' if gain.unit else ''
@@ -273,7 +226,7 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
             dest=f'gain_{gain.name}',
             nargs='+',
             metavar='VALUE',
-            type=_options.number,
+            type=_cli.number,
             help=f'{gain.description}{unit}: MIN MAX to sweep it, or one value (default: the first two '
             f'gains are swept, this one over {gain.usual[0]:g} to {gain.usual[1]:g}; else '
             f'{gain.default:g})',

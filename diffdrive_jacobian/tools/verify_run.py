@@ -20,21 +20,14 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.file import robot_parameters
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools import _cli, _options
-from diffdrive_jacobian.tools._messages import busy
+from diffdrive_jacobian.tools import _cli, _output
+from diffdrive_jacobian.tools.entry_points import DONE, FAILED
 
 PROGRAM = 'verify_run'
 
 
 def report(verification: Verification, tolerance: float, yaw_tolerance: float) -> str:
-    """Return a description of the differences, of several lines.
-
-    Args:
-        verification: The differences.
-        tolerance: Largest allowed difference of the position (m).
-        yaw_tolerance: Largest allowed difference of the heading (rad).
-    """
+    """Return lines about the differences, with the largest allowed ones (m, rad)."""
     lines = [
         f'{len(verification.seconds)} odometry messages, commands from {verification.source}, '
         f'starting at the first {verification.start}',
@@ -71,8 +64,7 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
-    parser = _parser()
-    return _run(parser, parser.parse_args(arguments), signals)
+    return _run(PROGRAM, _parser().parse(arguments, ros=False), signals)
 
 
 def run_as_option(program: str, option: str, arguments: Sequence[str], signals: Signals) -> int:
@@ -88,37 +80,36 @@ def run_as_option(program: str, option: str, arguments: Sequence[str], signals: 
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         parser.error(f'not allowed with {option}: {" ".join(word.strip() for word in unknown)}')
-    return _run(parser, options, signals)
+    return _run(program, options, signals)
 
 
-def _run(parser: argparse.ArgumentParser, options: argparse.Namespace, signals: Signals) -> int:
+def _run(program: str, options: argparse.Namespace, signals: Signals) -> int:
     def interrupted() -> bool:
         return signals.count > 0
 
     try:
         parameters = None if options.params_file is None else robot_parameters(options.params_file)
-        with busy(parser.prog, f'reading {printable(options.bag, PATH_LIMIT)}'):
+        with _output.busy(program, f'reading {options.bag}'):
             run = read_run(options.bag, namespace=options.namespace, interrupted=interrupted)
         if parameters is not None and len(run.cmd_vel_out):
-            return _cli.complain(
-                parser.prog,
+            raise UserError(
                 '--params-file and --robot have no effect: the bag has cmd_vel_out, the commands as the '
-                'robot applied them',
+                'robot applied them'
             )
-        with busy(parser.prog, 'simulating the run'):
+        with _output.busy(program, 'simulating the run'):
             verification = verify(run, parameters, interrupted=interrupted)
     except (UserError, BagError, ParameterError) as error:
-        return _cli.complain(parser.prog, error)
+        return _output.complain(program, error)
     except ReadingInterruptedError:
-        return _cli.interrupted(parser.prog)
+        return _output.interrupted(program)
     allowed = verification.allowed
     tolerance = allowed if options.tolerance is None else options.tolerance
     yaw_tolerance = allowed if options.yaw_tolerance is None else options.yaw_tolerance
     print(report(verification, tolerance, yaw_tolerance))
-    return _cli.DONE if verification.holds(tolerance, yaw_tolerance) else _cli.FAILED
+    return DONE if verification.holds(tolerance, yaw_tolerance) else FAILED
 
 
-def _parser(program: str = PROGRAM, option: str = '') -> argparse.ArgumentParser:
+def _parser(program: str = PROGRAM, option: str = '') -> _cli.Parser:
     parser = _cli.Parser(
         prog=program,
         usage=' '.join([program, *option.split(), 'BAG [options]']),
@@ -127,18 +118,16 @@ def _parser(program: str = PROGRAM, option: str = '') -> argparse.ArgumentParser
         'recorded; 1: it does not; 2: wrong arguments, or the bag cannot be read; '
         '130: interrupted.',
     )
-    _options.add_bag(parser)
+    parser.add_bag()
     default = f'{EXACT:g} if cmd_vel_out was recorded, else {BY_RECORDING_TIME:g}'
     for name, unit, of in (
         ('--tolerance', 'M', 'position in m'),
         ('--yaw-tolerance', 'RAD', 'heading in rad'),
     ):
-        text = f'largest allowed difference of the {of} (default: {default})'
-        _options.add_value(parser, name, unit, text)
-    _options.add_params_file(
-        parser,
+        parser.add_value(name, unit, f'largest allowed difference of the {of} (default: {default})')
+    parser.add_params_file(
         'ROS parameters of virtual_robot (YAML), if cmd_vel_out was not recorded '
-        '(default: those recorded in the bag)',
+        '(default: those recorded in the bag)'
     )
-    _options.add_namespace(parser)
+    parser.add_namespace()
     return parser

@@ -3,68 +3,126 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import errno
+import os
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli, _options, _page
-from diffdrive_jacobian.tools._startup import long_lived
+from diffdrive_jacobian.tools import _cli, _output
+from diffdrive_jacobian.tools.entry_points import DONE, FAILED, long_lived
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.live.server import LiveServer
 
 PROGRAM = 'watch_run'
+DISPLAYS = ('DISPLAY', 'WAYLAND_DISPLAY')
+"""Environment variables without which no browser can open a window."""
+STEERS = 'whoever knows this address can steer the robot; Ctrl-C ends'
+PLAYS = 'the page plays the bag; Ctrl-C ends'
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
-    own, ros = _cli.split_arguments(arguments)
     parser = _parser()
-    options = _cli.parse(parser, own)
+    options = parser.parse(arguments)
     if options.bag is None and options.rate is not None:
         parser.error('--rate needs a BAG: running robots have their own time')
-    if options.bag is not None and ros:
+    if options.bag is not None and options.ros:
         parser.error('a BAG needs no ROS arguments')
     try:
-        with _page.explaining_page_errors(options.port):
-            return _bag(options, signals) if options.bag is not None else _nodes(options, ros, signals)
-    except _page.PageError as error:
-        return _cli.complain(PROGRAM, error, _cli.FAILED)
+        with explaining_page_errors(options.port):
+            return (_watch_nodes if options.bag is None else _play)(options, signals)
+    except PageError as error:
+        return _output.complain(PROGRAM, error, FAILED)
+    except UserError as error:
+        return _output.complain(PROGRAM, error)
 
 
-def _bag(options: argparse.Namespace, signals: Signals) -> int:
+def _play(options: argparse.Namespace, signals: Signals) -> int:
     from diffdrive_jacobian.bags.bag_reader import BagError
     from diffdrive_jacobian.live.bag_player import watch_bag
 
     print(f'reading {options.bag}', flush=True)
+    ready = announcing(options, notice=PLAYS)
     try:
-        watch_bag(
-            options.bag,
-            port=options.port,
-            speed=options.rate or 1.0,
-            signals=signals,
-            ready=_page.announcing(options, notice=_page.PLAYS),
-        )
+        speed = options.rate or 1.0
+        watch_bag(options.bag, port=options.port, speed=speed, signals=signals, ready=ready)
     except BagError as error:
-        return _cli.complain(PROGRAM, error)
-    return _cli.DONE
+        return _output.complain(PROGRAM, error)
+    return DONE
 
 
-def _nodes(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
+def _watch_nodes(options: argparse.Namespace, signals: Signals) -> int:
     with long_lived(), signals.ending_at_once():
         from diffdrive_jacobian.live.node import watch_nodes
 
+    ready = announcing(options)
+    watch_nodes(ros_arguments=options.ros, port=options.port, signals=signals, ready=ready)
+    return DONE
+
+
+# --- The page of a tool
+
+
+def announcing(
+    options: argparse.Namespace, waiting: str = '', notice: str = STEERS
+) -> Callable[[LiveServer], None]:
+    """Return a function that prints the address of a server, and opens it in a browser.
+
+    Args:
+        options: The options of the page.
+        waiting: What happens when the page is open. Empty: nothing in particular.
+        notice: The last line: what the page can do, and how it ends.
+    """
+
+    def announce(server: LiveServer) -> None:
+        print(f'page: {server.url}')
+        if waiting:
+            print(f'{waiting} when the page is open')
+        print(notice, flush=True)
+        if not options.no_browser and any(map(os.environ.get, DISPLAYS)):
+            # Starting a browser may take seconds.
+            arguments = (server.opening_url,)
+            threading.Thread(target=webbrowser.open, args=arguments, daemon=True).start()
+
+    return announce
+
+
+class PageError(UserError):
+    """The page cannot be served."""
+
+
+@contextmanager
+def explaining_page_errors(port: int) -> Iterator[None]:
+    """Raise PageError where the given port cannot be used, or the module of the server is missing."""
     try:
-        watch_nodes(
-            ros_arguments=ros, port=options.port, signals=signals, ready=_page.announcing(options)
-        )
-    except UserError as error:
-        return _cli.complain(PROGRAM, error)
-    return _cli.DONE
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or '').split('.')[0] != 'websockets':
+            raise
+        raise PageError(
+            "the page needs the Python module websockets: pip install 'diffdrive_jacobian[live]'"
+        ) from error
+    except OSError as error:
+        why = {
+            errno.EADDRINUSE: 'is in use: choose another one, or none for any free one',
+            errno.EACCES: 'may not be used: choose one above 1023',
+        }.get(error.errno or 0)
+        if why is None or not port:
+            raise
+        raise PageError(f'--port {port} {why}') from error
 
 
 def _rate(text: str) -> float:
     from diffdrive_jacobian.live.commands import MAX_WORLD_SPEED, MIN_WORLD_SPEED
 
-    return _options.number_that(between(MIN_WORLD_SPEED, MAX_WORLD_SPEED))(text)
+    return _cli.number_that(between(MIN_WORLD_SPEED, MAX_WORLD_SPEED))(text)
 
 
 def _parser() -> _cli.Parser:
@@ -75,13 +133,9 @@ def _parser() -> _cli.Parser:
         'of the Jacobian chain. The page also steers them. With BAG the page plays a recorded run. '
         'Ctrl-C ends. Exit code 0: ended by Ctrl-C; 1: the page cannot be served; 2: wrong arguments.',
     )
-    _options.add_bag(parser, 'bag to play (default: show running robots)', nargs='?')
-    _options.add_value(
-        parser,
-        '-r --rate',
-        'X',
-        'with BAG: how much faster than recorded it starts (default: 1.0)',
-        kind=_rate,
+    parser.add_bag('bag to play (default: show running robots)', nargs='?')
+    parser.add_value(
+        '-r --rate', 'X', 'with BAG: how much faster than recorded it starts (default: 1.0)', kind=_rate
     )
-    _options.add_page(parser)
+    parser.add_page()
     return parser

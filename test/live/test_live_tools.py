@@ -15,7 +15,7 @@ from support.processes import open_world
 from websockets.sync.client import connect
 
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _page, drive_to, watch_run
+from diffdrive_jacobian.tools import drive_to, watch_run
 
 QUICK = ('--ros-args', '-p', 'go_to_goal:kp:=8.0', '-p', 'go_to_goal:kv:=4.0')
 
@@ -132,12 +132,12 @@ def test_the_browser_is_started_without_the_secret_and_only_on_a_display(capsys,
     server = SimpleNamespace(
         url='http://127.0.0.1:1/secret/', opening_url='http://127.0.0.1:1/open/once'
     )
-    monkeypatch.setattr(_page.webbrowser, 'open', opened_urls.append)
-    for name in _page.DISPLAYS:
+    monkeypatch.setattr(watch_run.webbrowser, 'open', opened_urls.append)
+    for name in watch_run.DISPLAYS:
         monkeypatch.delenv(name, raising=False)
-    _page.announcing(options)(server)
+    watch_run.announcing(options)(server)
     assert opened_urls == []
     assert 'page: http://127.0.0.1:1/secret/' in capsys.readouterr().out
     monkeypatch.setenv('DISPLAY', ':0')
-    _page.announcing(options)(server)
+    watch_run.announcing(options)(server)
     until(lambda: opened_urls == ['http://127.0.0.1:1/open/once'], 'the browser is started')

@@ -44,7 +44,7 @@ from diffdrive_jacobian.ros.liveness import LONGEST_STEP, PERIOD, Liveness
 from diffdrive_jacobian.ros.runner import discovery_off, ros_context, running
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _sending
+from diffdrive_jacobian.tools import send_goal as sending
 
 
 def add_client(ros, goals, **kwargs):
@@ -352,14 +352,13 @@ def test_the_report_does_not_claim_that_an_unknown_robot_was_stopped(capsys):
     options = argparse.Namespace(timeout=7.0, wait=10.0, x=1.0, y=1.0)
     values = {'result': Result.TIMEOUT, 'topic': '/goal_pose', 'status': GoalState.CANCELED}
     unknown = GoalResult(**values, canceled=True)
-    assert _sending.report(unknown, options, 'goal (1, 1)') == [
+    assert sending.report(unknown, options, 'goal (1, 1)') == [
         'not arrived within --timeout 7 s',
         'canceled: no odometry was received, so it is not known whether a robot drove',
     ]
     known = GoalResult(**values, canceled=True, distance=1.0)
-    assert _sending.report(known, options, 'goal (1, 1)')[1] == 'canceled: the robot was stopped'
-    with _sending.Progress('send_goal', 'goal (1, 1)') as progress:
-        progress.standing(5.0)
+    assert sending.report(known, options, 'goal (1, 1)')[1] == 'canceled: the robot was stopped'
+    sending.Progress('send_goal', 'goal (1, 1)').standing(5.0)
     assert capsys.readouterr().out == 'the robot has not moved for 5 s: call doctor to find out why\n'
 
 

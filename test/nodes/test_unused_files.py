@@ -12,7 +12,7 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.parameters.file import concerns, robot_parameters, sections
 from diffdrive_jacobian.ros.parameters import report_unknown
 from diffdrive_jacobian.ros.runner import ros_context
-from diffdrive_jacobian.tools._options import warn_of_unused_files
+from diffdrive_jacobian.tools._cli import warn_of_unused_files
 
 NAMESPACES = ('', '/a', '/a/b')
 KEYS = (

@@ -7,15 +7,17 @@ from dataclasses import replace
 
 import pytest
 
-from diffdrive_jacobian.diagnosis.description import (
+from diffdrive_jacobian.diagnosis.graph import (
     ClockMessages,
     Endpoint,
     Graph,
     Participant,
     Quality,
     Stream,
+    check_clocks,
+    check_topics,
+    mismatch,
 )
-from diffdrive_jacobian.diagnosis.graph import check_clocks, check_topics, mismatch
 from diffdrive_jacobian.diagnosis.machine import (
     INSTALLATION,
     ROS_PACKAGES,

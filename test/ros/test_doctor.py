@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from diffdrive_jacobian.diagnosis.description import Graph, Participant
+from diffdrive_jacobian.diagnosis.graph import Graph, Participant
 from diffdrive_jacobian.diagnosis.machine import SharedMemory
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import doctor

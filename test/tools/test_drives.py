@@ -1,68 +1,87 @@
-"""Drives from Python, without the command line."""
+"""Drives from Python and by the tool drive_to, mostly in simulated time."""
 
 from __future__ import annotations
 
+import errno
 import math
+import os
+import re
+import signal
+import threading
 from functools import partial
+from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter
+from support import commands
+from support.processes import open_world
 
-from diffdrive_jacobian.bags import read_run
-from diffdrive_jacobian.drives import DriveError, Outcome, drive, waypoints_through
-from diffdrive_jacobian.drives.driving import in_lockstep, in_real_time
+from diffdrive_jacobian.bags import journal, read_run
+from diffdrive_jacobian.bags.timeline import timeline
+from diffdrive_jacobian.drives import (
+    DriveError,
+    Outcome,
+    drive,
+    in_lockstep,
+    in_real_time,
+    waypoints_through,
+)
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.lockstep import runner as lockstep_runner
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.parameters.nodes import CONTROLLERS
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.testing import Lockstep
+from diffdrive_jacobian.tools import _output
 
 QUICK = {'kp': 12.0, 'kv': 3.0}
+# Integers are taken for doubles.
+QUICK_ARGUMENTS = ('--ros-args', '-p', 'kp:=12', '-p', 'kv:=3')
+CONFIGS = sorted((Path(__file__).parents[2] / 'config').glob('*.yaml'))
+RECORD = ('--no-plot', '-o', 'bag')
+CRAWL = (50, 0, '--timeout', '1e6', '--no-record', '--ros-args', '-p', 'linear.x.max_velocity:=0.001')
 
 
-class Progress:
-    """Keeps what it receives."""
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """Record to a temporary directory."""
+    monkeypatch.chdir(tmp_path)
 
-    def __init__(self):
-        self.names = []
-        self.states = []
 
-    def nodes_created(self, names):
-        self.names += names
-
-    def driving(self, *state):
-        self.states.append(state)
+# --- From Python
 
 
 def test_a_drive_from_python_returns_the_outcome():
-    progress = Progress()
+    progress = Mock()
     outcome = drive([[0.5, 0.0], [0.5, 0.5]], lockstep=True, parameters=QUICK, progress=progress)
     assert isinstance(outcome, Outcome)
     assert outcome.arrived
     assert not outcome.interrupted
     assert outcome.distance <= 0.02
     assert math.dist(outcome.pose[:2], (0.5, 0.5)) == pytest.approx(outcome.distance)
-    assert progress.names == ['/virtual_robot', '/wheel_bridge', '/go_to_goal', '/drive_to']
-    seconds, indices, distances, _ = zip(*progress.states, strict=True)
+    names = ['/virtual_robot', '/wheel_bridge', '/go_to_goal', '/drive_to']
+    progress.nodes_created.assert_called_once_with(names)
+    states = [call.args for call in progress.driving.call_args_list]
+    seconds, indices, distances, _ = zip(*states, strict=True)
     assert list(seconds) == sorted(seconds)
     assert sorted(set(indices)) == [0, 1]
     assert distances[0] == pytest.approx(0.5)
 
 
-def test_drives_in_lockstep_are_reproducible():
-    first, second = (drive([[0.3, 0.2]], lockstep=True, parameters=QUICK) for _ in range(2))
+def test_drives_in_lockstep_are_reproducible_and_recorded_where_the_caller_says():
+    recording = Recording(Path('bag'), 'mcap', lossless=True)
+    first = drive([[0.3, 0.2]], lockstep=True, parameters=QUICK, recording=recording)
+    recording.finish()
+    second = drive([[0.3, 0.2]], lockstep=True, parameters=QUICK)
     assert first.pose.tobytes() == second.pose.tobytes()
     assert (first.seconds, first.distance) == (second.seconds, second.distance)
-
-
-def test_a_drive_is_recorded_where_the_caller_says(tmp_path):
-    recording = Recording(tmp_path / 'bag', 'mcap', lossless=True)
-    outcome = drive([[0.3, 0.0]], lockstep=True, parameters=QUICK, recording=recording)
-    recording.finish()
-    run = read_run(tmp_path / 'bag')
-    np.testing.assert_array_equal(run.odometry.values[-1, :3], outcome.pose)
+    np.testing.assert_array_equal(read_run(Path('bag')).odometry.values[-1, :3], first.pose)
 
 
 def test_distance_is_that_of_the_driven_point():
@@ -75,10 +94,7 @@ def test_distance_is_that_of_the_driven_point():
     assert outcome.distance <= 0.02
 
 
-def test_timeout_and_signals_end_a_drive():
-    late = drive([[50.0, 0.0]], lockstep=True, timeout=0.5)
-    assert not late.arrived
-    assert late.seconds == pytest.approx(0.5, abs=0.03)
+def test_a_signal_ends_a_drive():
     signals = Signals()
     signals.count = 1
     assert drive([[50.0, 0.0]], lockstep=True, signals=signals).interrupted
@@ -100,8 +116,6 @@ def test_errors_are_typed(monkeypatch):
 
     def sleep(self, *_):
         self.get_clock().sleep_until(self.get_clock().now() + GoToGoal.LONG)
-
-    from rclpy.duration import Duration
 
     monkeypatch.setattr(GoToGoal, 'LONG', Duration(seconds=10), raising=False)
     monkeypatch.setattr(GoToGoal, '_on_odometry', sleep)
@@ -134,18 +148,12 @@ def test_goals_are_sent_one_after_the_other_in_one_runner():
 
 
 def test_an_error_of_the_progress_cancels_the_goal():
-    class Broken(Progress):
-        def waiting(self, reason):
-            pass
-
-        def driving(self, *state):
-            raise BrokenPipeError
-
+    progress = Mock(**{'driving.side_effect': BrokenPipeError})
     with in_lockstep() as runner:
         robot = runner.add(lambda: VirtualRobot(context=runner.context))
         controller = runner.add(lambda: GoToGoal(context=runner.context))
         with pytest.raises(BrokenPipeError):
-            send_goal([5.0, 0.0, 0.0], runner=runner, progress=Broken())
+            send_goal([5.0, 0.0, 0.0], runner=runner, progress=progress)
         assert controller.waypoint is None
         assert robot.get_publishers_info_by_topic('/goal_pose') == []
 
@@ -163,3 +171,156 @@ def test_waypoints_have_the_direction_to_the_next():
     waypoints = waypoints_through([[0, 0], [1, 0], [1, 2]], heading=-1.0)
     np.testing.assert_allclose(waypoints, [[0, 0, 0], [1, 0, math.pi / 2], [1, 2, -1.0]])
     np.testing.assert_array_equal(waypoints_through([[3, 4]]), [[3, 4, 0]])
+
+
+# --- drive_to
+
+
+def drive_to(*arguments, code=0):
+    """Run drive_to in simulated time; return the line about the drive."""
+    ended = commands.run('drive_to', '--lockstep', *arguments)
+    assert ended.code == code, ended
+    return next(line for line in ended.out.splitlines() if 'the robot stopped' in line)
+
+
+@pytest.mark.parametrize('goals', [(-1, 0), (0.5, 0, 0.5, 0.5, 0, 0), (0, 0)])
+def test_arrives(goals):
+    line = drive_to(*goals, '--no-record', *QUICK_ARGUMENTS)
+    numbers = re.fullmatch(
+        r'arrived: the robot stopped at x (\S+) m, y (\S+) m, heading \S+ rad, '
+        r'(\S+) m from the goal, after (\S+) s of simulated time',
+        line,
+    )
+    x, y, distance, _ = map(float, numbers.groups())
+    assert distance <= 0.02
+    assert math.dist((x, y), goals[-2:]) <= 0.021
+
+
+def test_the_true_distance_of_a_robot_that_slips_is_that_of_its_ground_truth():
+    slip = ('-p', 'simulate_slip:=true', '-p', 'wheel_travel_variance:=0.002')
+    line = drive_to(1, 1, *RECORD, *QUICK_ARGUMENTS, *slip)
+    found = re.search(r' (\S+) m from the goal by odometry, (\S+) m by ground truth, after', line)
+    distance, truth = map(float, found.groups())
+    end = read_run(Path('bag')).ground_truth.values[-1, :2]
+    assert distance <= 0.02 < truth
+    assert truth == pytest.approx(math.dist(end, (1.0, 1.0)), abs=1e-3)
+
+
+@pytest.mark.parametrize('config', CONFIGS, ids=lambda path: path.stem)
+def test_the_files_in_config_are_taken(config):
+    drive_to(0.2, 0.1, '--tolerance', 0.1, '--params-file', config, '--no-record')
+
+
+@pytest.mark.parametrize('controller', CONTROLLERS)
+def test_every_controller_arrives_and_takes_the_heading_that_is_asked_for(controller):
+    heading = -2.5
+    options = ('--heading', heading, '--controller', controller)
+    line = drive_to(0.5, 0.5, 0, 1, *options, *RECORD, *QUICK_ARGUMENTS)
+    x, y, theta = map(float, re.search(r'x (\S+) m, y (\S+) m, heading (\S+) rad', line).groups())
+    offset = 0.1 if controller == 'offset_point' else 0.0
+    assert math.hypot(x, y - 1.0) <= offset + 0.021
+    assert theta == pytest.approx(heading, abs=0.021)
+    run = read_run(Path('bag'))
+    seen = timeline(run)
+    last = seen.goal == 1
+    # Of the point that is driven: it comes to each goal, and nothing is taken for the next one too soon.
+    assert seen.distance[~last].min() <= 0.021
+    assert seen.distance[last].min() <= 0.021
+    assert seen.distance[~last][0] == pytest.approx(math.hypot(0.5 - offset, 0.5), abs=1e-6)
+    # The heading matters at the last goal alone.
+    error = np.angle(np.exp(1j * (heading - run.odometry.values[:, 2])))
+    np.testing.assert_allclose(seen.goal_heading_error[last], error[last], atol=1e-9)
+    assert np.isnan(seen.goal_heading_error[~last]).all()
+    assert abs(seen.goal_heading_error[-1]) <= 0.02
+    assert np.isnan(seen.bearing_error[-1])
+
+
+def test_without_a_heading_any_will_do():
+    line = drive_to(0, 1, *RECORD, '--ros-args', '-p', 'kp:=12.0', '-p', 'kv:=2.0')
+    theta = float(re.search(r'heading (\S+) rad', line).group(1))
+    assert theta == pytest.approx(math.pi / 2.0, abs=0.2)
+    assert np.isnan(timeline(read_run(Path('bag'))).goal_heading_error).all()
+
+
+def test_duration_is_that_of_the_control_law():
+    """Straight ahead the distance decays as exp(-kv t), in steps of the odometry's period."""
+    line = drive_to(1, 0, '--no-record', '--ros-args', '-p', 'kv:=2.0')
+    seconds = float(re.search(r'after (\S+) s of simulated time', line).group(1))
+    period, kv = 0.02, 2.0
+    steps = math.ceil(math.log(0.02) / math.log(1.0 - kv * period))
+    assert seconds == pytest.approx(steps * period, abs=0.1)
+
+
+def test_nothing_is_driven_once_the_drive_is_over():
+    """The timeout is over before the first odometry, so before a goal was sent."""
+    ended = commands.run('drive_to', 1, 1, '--timeout', '1e-9', *RECORD)
+    assert ended.code == 1
+    assert 'the robot stopped at x 0.000 m, y 0.000 m' in ended.out
+    run = read_run(Path('bag'))
+    assert len(run.goals) == 0
+    assert not run.cmd_vel_out.values.any()
+
+
+def test_timeout_is_of_simulated_time():
+    line = drive_to(50, 0, '--no-record', '--timeout', 3, code=1)
+    assert line.startswith('not arrived (--timeout 3 s was too short): ')
+    assert line.endswith('after 3.0 s of simulated time')
+
+
+FULL = 20_000
+"""Size at which the disk of a test is full (bytes): less than a drive of a second."""
+
+
+def test_a_full_disk_is_reported(tmp_path, monkeypatch):
+    """A drive that arrives, but of which only a part is recorded, is not done."""
+    write, written = os.write, []
+
+    def limited(descriptor, data):
+        if threading.current_thread().name == 'journal':
+            if sum(written) + len(data) > FULL:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            written.append(len(data))
+        return write(descriptor, data)
+
+    monkeypatch.setattr(journal.os, 'write', limited)
+    said = commands.run('drive_to', 1, 1, '--lockstep', *RECORD, *QUICK_ARGUMENTS)
+    assert said.code == 1
+    assert 'drive_to: error: the recording was aborted: No space left on device' in said.err
+    assert said.out.splitlines()[-1] == 'recorded in part: bag'
+    assert (tmp_path / 'bag.journal.mcap').exists()
+
+
+def test_a_stuck_callback_fails_and_the_recording_is_kept(tmp_path, monkeypatch):
+    """That run is the one to look at."""
+    on_odometry, never = GoToGoal._on_odometry, threading.Event()
+
+    def stuck(self, *args):
+        on_odometry(self, *args)
+        while self.get_clock().now().nanoseconds > 2_000_000_000:
+            never.wait(0.01)
+
+    monkeypatch.setattr(GoToGoal, '_on_odometry', stuck)
+    monkeypatch.setattr(lockstep_runner, 'Lockstep', partial(Lockstep, patience=0.5))
+    said = commands.run('drive_to', 1, 1, '--lockstep', *RECORD)
+    assert said.code == 1
+    assert said.err.startswith('drive_to: error: ')
+    assert '/go_to_goal' in said.err
+    assert said.out.splitlines()[-1] == 'recorded: bag'
+    assert len(read_run(tmp_path / 'bag').odometry) >= 50
+
+
+def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
+    monkeypatch.setattr(_output.GoalBar, 'show_goal', lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        commands.run('drive_to', 1, 1, '--lockstep', *RECORD)
+    assert (tmp_path / 'bag').is_dir()
+
+
+@pytest.mark.process
+def test_ends_on_a_signal(tmp_path):
+    with open_world(tmp_path) as world:
+        child = world.start('drive_to', '--lockstep', *map(str, CRAWL))
+        child.until_says('m to go')
+        child.signal(signal.SIGINT)
+        assert child.exit() == 130
+        assert child.last_line.startswith('interrupted: the robot stopped at x ')

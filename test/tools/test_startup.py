@@ -5,12 +5,14 @@ from __future__ import annotations
 import gc
 import json
 import os
+import signal
 import subprocess
 import sys
 
 import pytest
 
-from diffdrive_jacobian.tools import _startup
+from diffdrive_jacobian.signals import CAUGHT, Signals
+from diffdrive_jacobian.tools.entry_points import long_lived
 
 pytestmark = pytest.mark.process
 
@@ -41,7 +43,7 @@ def run(*arguments):
     # As rclpy does.
     sys.stderr = sys.__stderr__
     faulthandler.enable()
-    print('enabled')
+    print('enabled', os.environ['OPENBLAS_NUM_THREADS'])
 
 module = types.ModuleType('run_node')
 module.run_node = run
@@ -62,10 +64,11 @@ print(*sys.modules)
 """
 
 
-def run(*arguments: str) -> str:
+def run(*arguments: str, **variables: str) -> str:
     """Run an interpreter of its own, and return what it prints."""
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
     environment.pop('OPENBLAS_NUM_THREADS', None)
+    environment.update(variables)
     return subprocess.run(
         [sys.executable, '-c', *arguments],
         env=environment,
@@ -91,7 +94,7 @@ def test_a_node_starts_without_what_only_the_tools_need(started):
         *('matplotlib', 'rich', 'rosbags', 'ruamel.yaml'),
         # With the installed controllers.
         *('importlib.metadata', 'difflib'),
-        *('diffdrive_jacobian.diagnosis.description', 'diffdrive_jacobian.parameters.go_to_goal'),
+        *('diffdrive_jacobian.diagnosis.graph', 'diffdrive_jacobian.parameters.go_to_goal'),
     }
     assert not unneeded & set(modules)
 
@@ -113,20 +116,33 @@ def test_openblas_starts_no_threads(started):
     assert started[2] == '1'
 
 
-def test_a_number_of_threads_that_the_user_has_chosen_is_kept(monkeypatch):
-    monkeypatch.setenv('OPENBLAS_NUM_THREADS', '3')
-    _startup.without_blas_threads()
-    assert os.environ['OPENBLAS_NUM_THREADS'] == '3'
-
-
 def test_a_collector_that_was_disabled_before_stays_so():
     gc.disable()
     try:
-        with _startup.long_lived():
+        with long_lived():
             pass
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_a_process_is_ended_once_however_many_signals_come():
+    ended = []
+
+    def end():
+        ended.append(len(ended))
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    before = {number: signal.getsignal(number) for number in CAUGHT}
+    try:
+        signals = Signals(end)
+        signals.catch()
+        with signals.ending_at_once():
+            os.kill(os.getpid(), signal.SIGHUP)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert (ended, signals.count) == ([0], 2)
 
 
 def test_the_help_of_programs_that_need_ros_imports_nothing_slow():
@@ -136,5 +152,5 @@ def test_the_help_of_programs_that_need_ros_imports_nothing_slow():
     assert not slow & modules
 
 
-def test_a_process_that_was_started_without_stderr_gets_one():
-    assert run(WITHOUT_STDERR) == 'enabled\n'
+def test_a_process_without_stderr_gets_one_and_keeps_the_number_of_threads_of_the_user():
+    assert run(WITHOUT_STDERR, OPENBLAS_NUM_THREADS='3') == 'enabled 3\n'

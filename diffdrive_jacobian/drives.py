@@ -45,8 +45,26 @@ from diffdrive_jacobian.time_units import nanoseconds
 if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep.runner import LockstepRunner
 
+__all__ = [
+    'DriveError',
+    'DriveProgress',
+    'Outcome',
+    'drive',
+    'in_lockstep',
+    'in_real_time',
+    'waypoints_through',
+]
+
 NAME = 'drive_to'
 """Name of the node that sends the goals."""
+SETTLING = 0.1
+"""Odometry this much later than the last command shows its effect (s)."""
+DISCOVERY_PERIOD = 0.5
+"""Time between two searches for new topics to record (s)."""
+STANDING = 1e-3
+"""Speed and yaw rate up to which a robot is said to have stopped (m/s, rad/s)."""
+STOP_PATIENCE = 2.0
+"""Longest time in which the robot may come to rest at the end, and report that (s)."""
 
 
 class DriveError(DiffdriveError):
@@ -76,38 +94,21 @@ def in_real_time(ros_arguments: Sequence[str] = (), *, isolated: bool = True) ->
 def in_lockstep(ros_arguments: Sequence[str] = ()) -> Iterator[LockstepRunner]:
     """Create a runner of nodes in simulated time, and close it at the end.
 
-    Args:
-        ros_arguments: ROS arguments of all nodes.
-
     Raises:
-        UserError: The ROS arguments are invalid.
+        UserError: The ROS arguments, those of all nodes, are invalid.
         DriveError: A callback blocks, or simulated time cannot advance for another reason.
     """
     # Slow to import.
     from diffdrive_jacobian.lockstep._errors import LockstepError
     from diffdrive_jacobian.lockstep.runner import running_in_lockstep
 
-    with ExitStack() as stack:
-        try:
-            runner = stack.enter_context(running_in_lockstep(ros_arguments))
-        except LockstepError as error:
-            raise UserError(str(error)) from error
-        try:
+    created = False
+    try:
+        with running_in_lockstep(ros_arguments) as runner:
+            created = True
             yield runner
-        except LockstepError as error:
-            raise DriveError(str(error)) from error
-
-
-TIMEOUT = 300.0
-"""Default of the longest duration of a drive (s)."""
-SETTLING = 0.1
-"""Odometry this much later than the last command shows its effect (s)."""
-DISCOVERY_PERIOD = 0.5
-"""Time between two searches for new topics to record (s)."""
-STANDING = 1e-3
-"""Speed and yaw rate up to which a robot is said to have stopped (m/s, rad/s)."""
-STOP_PATIENCE = 2.0
-"""Longest time in which the robot may come to rest at the end, and report that (s)."""
+    except LockstepError as error:
+        raise (DriveError if created else UserError)(str(error)) from error
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -159,16 +160,6 @@ class DriveProgress(Protocol):
         """
 
 
-class _Silent:
-    """A progress that is not shown."""
-
-    def nodes_created(self, names: Sequence[str]) -> None:
-        pass
-
-    def driving(self, seconds: float, index: int, distance: float, wheels: tuple[float, float]) -> None:
-        pass
-
-
 def waypoints_through(places: ArrayLike, heading: float = 0.0) -> NDArray[np.float64]:
     """Return waypoints with a heading at each place.
 
@@ -196,7 +187,7 @@ def drive(
     runner: NodeRunner | None = None,
     lockstep: bool = False,
     isolated: bool = True,
-    timeout: float = TIMEOUT,
+    timeout: float = 300.0,
     parameters: Mapping[str, Any] | None = None,
     robot_parameters: Mapping[str, Any] | None = None,
     recording: Recording | None = None,
@@ -233,120 +224,99 @@ def drive(
             one of the arguments for a new runner is given together with `runner`.
     """
     number('timeout', timeout, positive_or_infinite)
+    if lockstep and not isolated:
+        raise ValueError('a drive in lockstep is always isolated: other processes have another clock')
+    if runner is not None and (lockstep or not isolated or ros_arguments):
+        raise ValueError('lockstep, isolated and ros_arguments are those of the runner, if one is given')
     if not isinstance(goals, Path):
         goals = np.asarray(goals, dtype=np.float64)
         if goals.ndim != 2 or goals.shape[1] != 3:
             goals = waypoints_through(goals)
-    sent = goals
-    if lockstep and not isolated:
-        raise ValueError('a drive in lockstep is always isolated: other processes have another clock')
-    if runner is None:
-        new = in_lockstep(ros_arguments) if lockstep else in_real_time(ros_arguments, isolated=isolated)
-        with new as created:
-            return drive(
-                goals,
-                relative=relative,
-                runner=created,
-                timeout=timeout,
-                parameters=parameters,
-                robot_parameters=robot_parameters,
-                recording=recording,
-                signals=signals,
-                progress=progress,
+    sent, signals = goals, signals or Signals()
+    with ExitStack() as stack:
+        if runner is None:
+            runner = stack.enter_context(
+                in_lockstep(ros_arguments)
+                if lockstep
+                else in_real_time(ros_arguments, isolated=isolated)
             )
-    if lockstep or not isolated or ros_arguments:
-        raise ValueError('lockstep, isolated and ros_arguments are those of the runner, if one is given')
-    signals = signals or Signals()
-    progress = progress or _Silent()
-    context = runner.context
-    of_robot = overrides({**(robot_parameters or {}), 'command_interface': 'wheels'})
-    robot = runner.add(lambda: VirtualRobot(context=context, parameter_overrides=of_robot))
-    bridge = runner.add(lambda: WheelBridge(context=context))
-    of_controller = overrides(parameters or {})
-    controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=of_controller))
-    client = runner.add(lambda: GoalClient(NAME, sent, context, relative=relative))
-    client.arrival = controller.arrival
-    wheels = WheelSpeeds(client, robot.parameters.wheel_names)
-    nodes = (robot, bridge, controller, client)
-    progress.nodes_created([node.get_fully_qualified_name() for node in nodes])
-    discover = recorder_of(runner, recording)
-    client.send_on_odometry()
-    started = runner.seconds()
+        context = runner.context
+        of_robot = overrides({**(robot_parameters or {}), 'command_interface': 'wheels'})
+        robot = runner.add(lambda: VirtualRobot(context=context, parameter_overrides=of_robot))
+        bridge = runner.add(lambda: WheelBridge(context=context))
+        of_controller = overrides(parameters or {})
+        controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=of_controller))
+        client = runner.add(lambda: GoalClient(NAME, sent, context, relative=relative))
+        client.arrival = controller.arrival
+        speeds = (0.0, 0.0)
 
-    def ended() -> bool:
-        discover()
-        if client.robot is not None and not client.ended:
-            index = controller.waypoint
-            if index is not None:
-                # A goal of another process may have more poses.
-                client.index = min(index, len(client.goals) - 1)
-            seconds = runner.seconds() - started
-            progress.driving(seconds, client.index, client.distance, wheels.speeds)
-        return client.ended
+        def on_joint_states(wheels: Wheels) -> None:
+            nonlocal speeds
+            # Other processes may publish, and anything.
+            with suppress(MessageError):
+                speeds = wheels.speeds(robot.parameters.wheel_names)
 
-    runner.spin(ended, timeout=timeout, signals=signals)
-    seconds, status = runner.seconds() - started, client.status
-    client.withdraw()
-    reason = 'interrupted' if signals.count else 'timeout'
-    if not client.ended:
-        controller.stop(reason)
-    settled = robot.now() + nanoseconds(SETTLING)
+        received = ignoring_invalid(JOINT_STATE, JointState, on_joint_states)
+        client.create_subscription(JointState, 'joint_states', received, 10, raw=True)
+        nodes = (robot, bridge, controller, client)
+        if progress is not None:
+            progress.nodes_created([node.get_fully_qualified_name() for node in nodes])
+        discover = recorder_of(runner, recording)
+        client.send_on_odometry()
+        started = runner.seconds()
 
-    def stands() -> bool:
-        discover()
-        if controller.waypoint is not None:
-            # The goals were received only now.
+        def ended() -> bool:
+            discover()
+            if progress is not None and client.robot is not None and not client.ended:
+                index = controller.waypoint
+                if index is not None:
+                    # A goal of another process may have more poses.
+                    client.index = min(index, len(client.goals) - 1)
+                seconds = runner.seconds() - started
+                progress.driving(seconds, client.index, client.distance, speeds)
+            return client.ended
+
+        runner.spin(ended, timeout=timeout, signals=signals)
+        seconds, status = runner.seconds() - started, client.status
+        client.withdraw()
+        reason = 'interrupted' if signals.count else 'timeout'
+        if not client.ended:
             controller.stop(reason)
-        state = client.robot
-        return state is not None and state.stamp >= settled and not state.moving
+        settled = robot.now() + nanoseconds(SETTLING)
 
-    patience = STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
-    runner.spin(stands, timeout=patience, signals=signals, handled=signals.count)
-    client.index = len(client.goals) - 1
-    true_distance = math.nan
-    if robot.parameters.drift() is not None:
-        true_distance = float(
-            controller.arrival.distance(*robot.truth.tolist(), *client.goals[-1, :2].tolist())
+        def stands() -> bool:
+            discover()
+            if controller.waypoint is not None:
+                # The goals were received only now.
+                controller.stop(reason)
+            state = client.robot
+            return state is not None and state.stamp >= settled and not state.moving
+
+        patience = STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
+        runner.spin(stands, timeout=patience, signals=signals, handled=signals.count)
+        client.index = len(client.goals) - 1
+        true_distance = math.nan
+        if robot.parameters.drift() is not None:
+            true_distance = float(
+                controller.arrival.distance(*robot.truth.tolist(), *client.goals[-1, :2].tolist())
+            )
+        return Outcome(
+            status=status,
+            interrupted=signals.count > 0,
+            pose=None if client.robot is None else client.robot.pose,
+            moving=client.robot is not None and client.robot.fastest > STANDING,
+            distance=client.distance,
+            true_distance=true_distance,
+            across=math.nan if client.path is None else client.path.greatest,
+            tolerance=controller.arrival.xy_tolerance,
+            offset=controller.arrival.offset,
+            seconds=seconds,
         )
-    return Outcome(
-        status=status,
-        interrupted=signals.count > 0,
-        pose=None if client.robot is None else client.robot.pose,
-        moving=client.robot is not None and client.robot.fastest > STANDING,
-        distance=client.distance,
-        true_distance=true_distance,
-        across=math.nan if client.path is None else client.path.greatest,
-        tolerance=controller.arrival.xy_tolerance,
-        offset=controller.arrival.offset,
-        seconds=seconds,
-    )
 
 
 def overrides(parameters: Mapping[str, Any]) -> list[Parameter]:
     """Return parameters, by name, as a node takes them."""
     return [Parameter(name, value=value) for name, value in parameters.items()]
-
-
-class WheelSpeeds:
-    """The speeds of the wheels, from `joint_states`."""
-
-    def __init__(self, node: GoalClient, names: tuple[str, str]) -> None:
-        """Subscribe with a node.
-
-        Args:
-            node: The node.
-            names: Joints of the left and the right wheel.
-        """
-        self._names = names
-        self.speeds = (0.0, 0.0)
-        """Speeds of the right and the left wheel (rad/s)."""
-        received = ignoring_invalid(JOINT_STATE, JointState, self._on_joint_states)
-        node.create_subscription(JointState, 'joint_states', received, 10, raw=True)
-
-    def _on_joint_states(self, wheels: Wheels) -> None:
-        # Other processes may publish, and anything.
-        with suppress(MessageError):
-            self.speeds = wheels.speeds(self._names)
 
 
 def recorder_of(runner: NodeRunner, recording: Recording | None) -> Callable[[], None]:
