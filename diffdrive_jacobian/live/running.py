@@ -22,8 +22,7 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.recording.recording import Recording
-from diffdrive_jacobian.ros.node_runner import NodeRunner
-from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.ros.runner import NodeRunner, ros_context, running
 from diffdrive_jacobian.signals import Signals
 
 

@@ -19,7 +19,6 @@ from diffdrive_jacobian.messages.codecs import (
 )
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.topic_faults import UNREAD
-from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
 from diffdrive_jacobian.ros.graph_faults import (
     ALTERNATION_PATIENCE,
@@ -29,7 +28,7 @@ from diffdrive_jacobian.ros.graph_faults import (
 )
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import restart_timer
-from diffdrive_jacobian.ros.watchdog import Watchdog
+from diffdrive_jacobian.ros.watchdog import Watchdog, command_time
 from diffdrive_jacobian.simulation.actuators import ramp
 from diffdrive_jacobian.simulation.robot import STANDSTILL
 from diffdrive_jacobian.simulation.speeds import Profile

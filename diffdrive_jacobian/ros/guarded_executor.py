@@ -19,7 +19,6 @@ are executed until they are done.
 from __future__ import annotations
 
 import time
-from typing import Protocol
 
 from rclpy.context import Context
 from rclpy.executors import Executor, SingleThreadedExecutor
@@ -56,22 +55,6 @@ TASK_PERIOD = 0.01
 """Period at which tasks of the EventsExecutor are executed while the nodes are on the other one (s)."""
 LOG_BURST, LOG_PERIOD = 3, 60.0
 """Episodes that are logged: the first ones, then one per period (s)."""
-
-
-class NodeExecutor(Protocol):
-    """What a runner needs of an executor."""
-
-    def add_node(self, node: Node) -> object:
-        """Execute the callbacks of a node from now on."""
-
-    def remove_node(self, node: Node) -> None:
-        """Execute no more callbacks of a node."""
-
-    def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Execute one callback; wait for it for at most a time (s)."""
-
-    def shutdown(self) -> object:
-        """Release the nodes."""
 
 
 class GuardedExecutor:

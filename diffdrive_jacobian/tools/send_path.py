@@ -22,16 +22,16 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         path = path.timed(options.speed)
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
-        from diffdrive_jacobian.nodes.remote_goal import send_path
+        from diffdrive_jacobian.nodes.remote_goal import send_goal
 
     return _sending.send(
         PROGRAM,
         f'path {options.path}',
-        send_path,
+        send_goal,
         options,
         ros,
         signals,
-        path=path,
+        goal=path,
         relative=_options.is_relative(options.path) and not options.frame,
     )
 

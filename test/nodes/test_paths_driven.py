@@ -22,7 +22,7 @@ from diffdrive_jacobian.drives import drive, in_lockstep
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
-from diffdrive_jacobian.nodes.remote_goal import Result, send_path
+from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.plots.run_figure import figure
 from diffdrive_jacobian.plots.run_table import write_csv
@@ -129,9 +129,9 @@ def test_send_path_follows_a_path_cancels_a_long_one_and_reports_a_refused_one()
     with in_lockstep() as runner:
         runner.add(lambda: VirtualRobot(context=runner.context))
         runner.add(lambda: GoToGoal(context=runner.context))
-        arrived = send_path(circle_path(0.15), runner=runner, relative=True)
-        canceled = send_path(line_path(5.0), runner=runner, relative=True, timeout=1.0)
-        refused = send_path(line_path(5.0), runner=runner, frame='map')
+        arrived = send_goal(circle_path(0.15), runner=runner, relative=True)
+        canceled = send_goal(line_path(5.0), runner=runner, relative=True, timeout=1.0)
+        refused = send_goal(line_path(5.0), runner=runner, frame='map')
     assert arrived.arrived
     assert arrived.topic == '/path'
     assert arrived.across < 0.01
@@ -140,7 +140,7 @@ def test_send_path_follows_a_path_cancels_a_long_one_and_reports_a_refused_one()
     assert 4.0 < canceled.distance < 5.0
     assert (refused.status, refused.across) == (GoalState.ABORTED, None)
     with pytest.raises(ValueError, match='path must have at most 10000 poses, got 20001'):
-        send_path(Path(np.column_stack([np.arange(20_001.0)] * 2)))
+        send_goal(Path(np.column_stack([np.arange(20_001.0)] * 2)))
 
 
 def test_a_trajectory_is_sent_with_stamps_where_the_robot_is(ros):
