@@ -227,14 +227,14 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     def _validate_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            changed(self.parameters, changes)
+            changed(self.parameters, {one.name: one.value for one in changes})
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, changes: list[Parameter]) -> None:
         previous = self.parameters
-        self.parameters = changed(previous, changes)
+        self.parameters = changed(previous, {one.name: one.value for one in changes})
         if self.parameters is previous:
             return
         if type(self.parameters) is not type(previous):
