@@ -14,6 +14,7 @@ from diffdrive_jacobian.simulation.robot_model import RobotModel
 from diffdrive_jacobian.text import printable
 
 _GREATEST = 1e6
+_SMALLEST = 1e-200
 _RATES = {
     'max_acceleration': (1.0, 'Maximum acceleration forward', 'no limits of the acceleration'),
     'max_deceleration': (-1.0, 'Maximum deceleration of forward motion, negative', 'as in reverse'),
@@ -75,6 +76,11 @@ def number_or(value: float, otherwise: float) -> float:
     return otherwise if math.isnan(value) else value
 
 
+def _limit(value: float, otherwise: float) -> float:
+    """Return a limit: zero if it is so small that the quotient of a speed and it overflows."""
+    return number_or(0.0 if abs(value) < _SMALLEST else value, otherwise)
+
+
 def differ(first: str, value: str, second: str, other: str) -> None:
     """Raise ParameterError if the values of two parameters are equal."""
     if value == other:
@@ -130,12 +136,12 @@ class TwistParameters(NodeParameters):
 
     def limits(self, default: float = math.inf) -> VelocityLimits:
         """Return the limits of the twist, `default` where none is set (m/s, rad/s)."""
-        max_v = number_or(self.linear_x_max_velocity, default)
-        max_omega = number_or(self.angular_z_max_velocity, default)
+        max_v = _limit(self.linear_x_max_velocity, default)
+        max_omega = _limit(self.angular_z_max_velocity, default)
         return VelocityLimits(
-            min_v=number_or(self.linear_x_min_velocity, -max_v),
+            min_v=_limit(self.linear_x_min_velocity, -max_v),
             max_v=max_v,
-            min_omega=number_or(self.angular_z_min_velocity, -max_omega),
+            min_omega=_limit(self.angular_z_min_velocity, -max_omega),
             max_omega=max_omega,
         )
 

@@ -20,10 +20,10 @@ from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from support.processes import World
+from support.ros_messages import goal
 
-from process_faults.fuzzed_parameters import finite
 from process_faults.outcome import Outcome, unexpected
-from process_faults.worlds import quiet_world
+from process_faults.worlds import finite, quiet_world, spin
 
 STEP = 0.02
 """Time between two messages on /clock (s)."""
@@ -96,11 +96,6 @@ class Simulation:
             assert time.monotonic() < end, f'not within 20 s: {what}'
             self.tick()
 
-    def send(self, x: float, y: float) -> None:
-        message = PoseStamped()
-        message.pose.position.x, message.pose.position.y, message.pose.orientation.w = x, y, 1.0
-        self.goal.publish(message)
-
     def arrive(self) -> None:
         """Send a goal half a metre away, more than once if need be, and wait for the arrival."""
         sent = -math.inf
@@ -111,7 +106,7 @@ class Simulation:
                 sent = time.monotonic()
                 self.statuses.clear()
                 at = self.heard['odom'].pose.pose.position
-                self.send(at.x + 0.3, at.y + 0.4)
+                self.goal.publish(goal(at.x + 0.3, at.y + 0.4))
             return any(one.status == GoalStatus.STATUS_SUCCEEDED for one in self.statuses)
 
         self.until(lambda: 'odom' in self.heard, 'the robot publishes odometry')
@@ -143,9 +138,7 @@ def pause(made: Simulation, chance: random.Random) -> str:
 
 
 def silence(made: Simulation, chance: random.Random) -> str:
-    end = time.monotonic() + chance.uniform(0.1, 1.5)
-    while time.monotonic() < end:
-        made.harness.executor.spin_once(timeout_sec=0.01)
+    spin(made.harness, chance.uniform(0.1, 1.5))
     return 'is silent'
 
 
@@ -154,9 +147,7 @@ def disagree(made: Simulation, chance: random.Random) -> str:
     for _ in range(chance.randrange(3, 40)):
         made.publish(made.now)
         made.publish(made.now + ahead, 1)
-        end = time.monotonic() + SETTLED / 5
-        while time.monotonic() < end:
-            made.tick()
+        made.run(SETTLED / 5)
     return f'two of them disagree by {ahead:g} s'
 
 
@@ -164,9 +155,7 @@ def implausible(made: Simulation, chance: random.Random) -> str:
     times = [chance.choice((-1.0, -(2.0**31), MOST, 1e-9, 0.0, 2.0**30)) for _ in range(5)]
     for one in times:
         made.publish(one)
-        end = time.monotonic() + SETTLED
-        while time.monotonic() < end:
-            made.harness.executor.spin_once(timeout_sec=0.005)
+        spin(made.harness, SETTLED)
     return f'has the times {times}'
 
 
@@ -187,7 +176,7 @@ def run(count: int, seed: int = 0) -> Outcome:
     with tempfile.TemporaryDirectory(prefix='clocks_') as name, quiet_world(Path(name)) as world:
         made = Simulation(world)
         for index in range(count):
-            made.send(50.0, 1.0)
+            made.goal.publish(goal(50, 1))
             made.run(chance.uniform(0.05, 0.3))
             # Now and then several at once.
             happened = [EVENTS[index % len(EVENTS)](made, chance)]

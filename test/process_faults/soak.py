@@ -23,13 +23,13 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from support.processes import Child, World
+from support.ros_messages import goal, placement
 
-from diffdrive_jacobian.parameters.declaration import default_of, specifications
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
-from process_faults.fuzzed_parameters import NODES, value_of
-from process_faults.hostile import damaged, resident, valid
+from process_faults.fuzzed_parameters import DECLARED, value_of
+from process_faults.hostile import VALID, damaged, resident
 from process_faults.outcome import Outcome
-from process_faults.worlds import quiet_world
+from process_faults.worlds import quiet_world, spin
 
 PERIOD = 3.0
 """Mean time between two faults (s)."""
@@ -95,19 +95,17 @@ class Team:
         self.nodes[name] = self.world.start(name, *arguments)
 
     def send_goal(self, x: float, y: float) -> None:
-        message = PoseStamped()
-        message.pose.position.x, message.pose.position.y, message.pose.orientation.w = x, y, 1.0
-        self.publishers['goal_pose'].publish(message)
+        self.publishers['goal_pose'].publish(goal(x, y))
 
     def reset(self) -> None:
         """Set all parameters that can change to their defaults, or to those of the command line."""
         given = {'kp': 6.0, 'kv': 1.0, 'linear.x.max_velocity': 1.0}
-        for name, parameters in NODES.items():
-            messages = []
-            for parameter, (field, specification) in specifications(parameters).items():
-                value = given.get(parameter, default_of(parameters, field))
-                if not specification.read_only:
-                    messages.append(Parameter(parameter, value=value).to_parameter_msg())
+        for name, parameters in DECLARED.items():
+            messages = [
+                Parameter(one, value=given.get(one, default)).to_parameter_msg()
+                for one, (specification, default) in parameters.items()
+                if not specification.read_only
+            ]
             # Twice: a limit may be refused while another one is still changed.
             for _ in range(2):
                 future = self.set[name].call_async(SetParameters.Request(parameters=messages))
@@ -163,18 +161,13 @@ class Soak:
     def memory(self) -> dict[str, float]:
         return {name: resident(child._process.pid) for name, child in self.lasting.items()}
 
-    def spin(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.harness.executor.spin_once(timeout_sec=0.05)
-
     # --- Faults
 
     def _stop(self) -> None:
         team = self.chance.choice((self.steady, self.other))
         child = self.chance.choice([*team.nodes.values(), self.page])
         child.signal(signal.SIGSTOP)
-        self.spin(self.chance.uniform(0.1, 2.5))
+        spin(self.harness, self.chance.uniform(0.1, 2.5))
         child.signal(signal.SIGCONT)
 
     def _restart(self, number: int) -> None:
@@ -193,7 +186,7 @@ class Soak:
 
     def _hostile(self) -> None:
         topic, kind = self.chance.choice(INPUTS)
-        data = serialize_message(valid(kind))
+        data = serialize_message(VALID[kind])
         for _ in range(60):
             for _ in range(10):
                 try:
@@ -201,25 +194,23 @@ class Soak:
                 except RCLError:
                     # It is longer than a message of the type can be.
                     continue
-            self.spin(0.005)
+            spin(self.harness, 0.005)
 
     def _flood(self) -> None:
         topic, kind = self.chance.choice(INPUTS)
-        data = serialize_message(valid(kind))
+        data = serialize_message(VALID[kind])
         end = time.monotonic() + 0.5
         while time.monotonic() < end:
             self.steady.publishers[topic].publish(data)
 
     def _parameter(self) -> None:
-        name = self.chance.choice(list(NODES))
-        known = specifications(NODES[name])
-        parameter = self.chance.choice(list(known))
-        field, specification = known[parameter]
-        value = value_of(self.chance, specification, default_of(NODES[name], field))
+        name = self.chance.choice(list(DECLARED))
+        parameter = self.chance.choice(list(DECLARED[name]))
+        value = value_of(self.chance, *DECLARED[name][parameter])
         message = ParameterMessage(name=parameter, value=value)
         client = self.steady.set[name]
         client.remove_pending_request(client.call_async(SetParameters.Request(parameters=[message])))
-        self.spin(1.0)
+        spin(self.harness, 1.0)
         self.steady.reset()
 
     def _goals(self) -> None:
@@ -231,20 +222,18 @@ class Soak:
         client.remove_pending_request(client.call_async(Trigger.Request()))
 
     def _place(self) -> None:
-        message = PoseWithCovarianceStamped()
-        message.pose.pose.position.x, message.pose.pose.orientation.w = self.chance.uniform(-2, 2), 1.0
-        self.steady.publishers['initialpose'].publish(message)
+        self.steady.publishers['initialpose'].publish(placement(self.chance.uniform(-2, 2)))
 
     def _drive_by_hand(self) -> None:
         end = time.monotonic() + self.chance.uniform(0.1, 1.0)
         while time.monotonic() < end:
-            self.steady.publishers['cmd_vel'].publish(valid(Twist))
-            self.spin(0.05)
+            self.steady.publishers['cmd_vel'].publish(VALID[Twist])
+            spin(self.harness, 0.05)
 
     def _join(self) -> None:
         peer = self.harness.peer
         subscription = peer.create_subscription(Odometry, '/steady/odom', lambda _: None, 10)
-        self.spin(self.chance.uniform(0.1, 1.0))
+        spin(self.harness, self.chance.uniform(0.1, 1.0))
         peer.destroy_subscription(subscription)
 
 
@@ -272,7 +261,7 @@ def run(count: int, seed: int = 0) -> Outcome:
             except AssertionError as error:
                 violations.append(f'{fault}: {error}')
             faults += 1
-            made.spin(chance.uniform(0.5, 1.5) * PERIOD)
+            spin(made.harness, chance.uniform(0.5, 1.5) * PERIOD)
             memory = made.memory()
             if elapsed <= FIRST or not first:
                 first = memory

@@ -20,9 +20,10 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from support.processes import Child, World
+from support.ros_messages import goal
 
 from process_faults.outcome import Outcome, spread, unexpected
-from process_faults.worlds import quiet_world
+from process_faults.worlds import moves, quiet_world, spin
 
 TIMEOUT = 0.5
 """Timeout of commands and of odometry (s), the default of the nodes."""
@@ -66,25 +67,19 @@ class Team:
 
     def drive(self, x: float) -> None:
         """Send a goal until the robot moves."""
-        message = PoseStamped()
-        message.pose.position.x, message.pose.orientation.w = x, 1.0
         sent = 0.0
 
         def drives() -> bool:
             nonlocal sent
             if time.monotonic() > sent + 1.0:
                 sent = time.monotonic()
-                self.goal.publish(message)
-            return self.moves()
+                self.goal.publish(goal(x, 0))
+            return self.drives()
 
         self.harness.until(drives, 'the robot drives')
 
-    def moves(self) -> bool:
-        return bool(self.heard['odom']) and moving(self.heard['odom'][-1][1])
-
-    def spin(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        self.harness.until(lambda: time.monotonic() >= end, patience=seconds + 10.0)
+    def drives(self) -> bool:
+        return bool(self.heard['odom']) and moves(self.heard['odom'][-1][1])
 
     def clear(self) -> None:
         for one in self.heard.values():
@@ -92,7 +87,7 @@ class Team:
 
     def stopped_after(self, topic: str, since: float) -> float:
         """Return how long after a time the last moving message came (s); negative: there was none."""
-        times = [at for at, message in self.heard[topic] if moving(message) and at > since]
+        times = [at for at, message in self.heard[topic] if moves(message) and at > since]
         return times[-1] - since if times else -1.0
 
 
@@ -102,13 +97,6 @@ def when(message: Any) -> float:
         return time.monotonic()
     stamp = message.header.stamp
     return stamp.sec + stamp.nanosec / 1e9 - time.time() + time.monotonic()
-
-
-def moving(message: Any) -> bool:
-    if isinstance(message, JointState):
-        return any(message.velocity)
-    twist = message.twist.twist if isinstance(message, Odometry) else message
-    return bool(twist.linear.x or twist.angular.z)
 
 
 MUST_STOP = {
@@ -123,19 +111,19 @@ def disturb(team: Team, name: str, kill: bool, chance: random.Random) -> tuple[l
     """Disturb a node while it drives; return what broke the promise, and how soon the others stopped."""
     what = f'{name}, {"SIGKILL" if kill else "SIGSTOP"}'
     team.drive(200.0)
-    team.spin(chance.uniform(0.0, 0.6))
+    spin(team.harness, chance.uniform(0.0, 0.6))
     team.clear()
     node = team.nodes[name]
     node.signal(signal.SIGKILL if kill else signal.SIGSTOP)
     since = time.monotonic()
-    team.spin(HOLD + chance.uniform(0.3, 1.5))
+    spin(team.harness, HOLD + chance.uniform(0.3, 1.5))
     violations, delays = [], []
     for topic in MUST_STOP[name]:
         delay = team.stopped_after(topic, since)
         delays.append(delay)
         if delay > TIMEOUT + LATE:
             violations.append(f'{what}: {topic} was not zero for {delay:.2f} s')
-        if moving(team.heard[topic][-1][1]):
+        if moves(team.heard[topic][-1][1]):
             violations.append(f'{what}: {topic} is not zero at the end')
     if kill:
         node.exit()
@@ -164,13 +152,11 @@ def arrive(team: Team) -> None:
     while not arrived():
         # The robot may have been elsewhere, or the goal lost with a controller.
         x = team.heard['odom'][-1][1].pose.pose.position.x
-        message = PoseStamped()
-        message.pose.position.x, message.pose.orientation.w = x + 0.2, 1.0
-        team.goal.publish(message)
+        team.goal.publish(goal(x + 0.2, 0))
         end = time.monotonic() + 4.0
         team.harness.until(lambda end=end: arrived() or time.monotonic() > end, 'arrival')
         assert time.monotonic() < begun + 20.0, f'not within 20 s: {team.statuses[-1:]}'
-    team.harness.until(lambda: not team.moves(), 'the robot stands')
+    team.harness.until(lambda: not team.drives(), 'the robot stands')
 
 
 def run(count: int, seed: int = 0) -> Outcome:
