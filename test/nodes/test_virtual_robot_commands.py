@@ -47,21 +47,15 @@ def driving(lockstep, robot_at):
 # --- Commands
 
 
-def test_invalid_twists_are_dropped(lockstep, robot_at, capfd):
+def test_what_a_differential_drive_cannot_do_is_ignored(lockstep, robot_at):
     topics = Topics(lockstep)
     robot_at(cmd_vel_timeout=0.0)
-    fields = [f'{part}.{axis}' for part in ('linear', 'angular') for axis in 'xyz']
-    cases = [(name, bad) for name in fields for bad in (math.nan, -math.inf)]
-    for bad in (1000.0000001, -1000.0000001, 1e308):
-        cases += [(name, bad) for name in ('linear.x', 'angular.z')]
-    for name, bad in cases:
-        lockstep.publish('cmd_vel', spoiled(twist(0.5, 0.5), name, bad))
-        assert topics.applied == [], (name, bad)
-    assert 'command dropped: twist must be finite, got linear' in capfd.readouterr().err
-    # What a differential drive cannot do is passed over, and the largest that is plausible is driven.
     for name in ('linear.y', 'linear.z', 'angular.x', 'angular.y'):
         lockstep.publish('cmd_vel', spoiled(twist(0.5, 0.25), name, 1e300))
         assert twists(topics.applied)[-1] == (0.5, 0.25)
+        lockstep.publish('cmd_vel', spoiled(twist(0.1, 0.1), name, math.nan))
+    assert len(topics.applied) == 4
+    # The largest that is plausible.
     lockstep.publish('cmd_vel', twist(-1000.0, 1000.0))
     assert twists(topics.applied)[-1] == (-1000.0, 1000.0)
 
