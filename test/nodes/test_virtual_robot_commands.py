@@ -157,8 +157,9 @@ def test_commands_late_by_less_than_their_distance_give_the_path_of_their_stamps
 
 
 @late
-@pytest.mark.parametrize('rate', [3.0, 50.0])
-@pytest.mark.parametrize('timeout', [1e-10, 1e-9, 0.0333, 0.5])
+@pytest.mark.parametrize(
+    ('timeout', 'rate'), [(1e-10, 50.0), (1e-9, 3.0), (0.0333, 50.0), (0.5, 50.0), (0.5, 3.0)]
+)
 def test_timeout_strikes_at_its_own_time_whatever_the_rate(lockstep, robot_at, timeout, rate):
     topics = Topics(lockstep)
     robot_at(cmd_vel_timeout=timeout, publish_rate=rate)
