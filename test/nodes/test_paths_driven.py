@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import re
-import signal
 
 import numpy as np
 import pytest
@@ -217,19 +216,6 @@ def test_a_path_that_was_refused_or_is_none_never_counts(tmp_path):
 def world(tmp_path):
     with open_world(tmp_path) as opened:
         yield opened
-
-
-@pytest.mark.process
-def test_ctrl_c_cancels_a_path(world):
-    drive = Drive(world)
-    sender = world.start('send_path', 'circle:1.0')
-    sender.until_says('m to go')
-    drive.harness.until(drive.drives, 'the robot drives')
-    sender.signal(signal.SIGINT)
-    assert sender.exit(5.0) == 130
-    assert sender.last_line == 'canceled: the robot was stopped'
-    assert 'Traceback' not in sender.stderr
-    drive.until_canceled()
 
 
 @pytest.mark.process

@@ -175,16 +175,6 @@ def test_timeout_strikes_at_its_own_time_whatever_the_rate(lockstep, robot_at, t
 
 
 @late
-def test_without_a_timeout_a_command_holds_for_ever(lockstep, robot_at):
-    topics = Topics(lockstep)
-    robot_at(cmd_vel_timeout=0.0, publish_rate=0.1)
-    lockstep.publish('cmd_vel', twist(1.0, 0.0))
-    lockstep.run_for(3600.0)
-    assert len(topics.applied) == 1
-    assert pose_of(topics.odom[-1]).tolist() == [3600.0, 0.0, 0.0]
-
-
-@late
 def test_a_command_at_the_time_of_the_timeout_costs_no_way(lockstep, driving):
     lockstep.run_for(0.5)
     lockstep.publish('cmd_vel', twist(1.0, 0.0))
