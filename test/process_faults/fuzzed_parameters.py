@@ -10,13 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from geometry_msgs.msg import Twist
-from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter, parameter_value_to_python
-from sensor_msgs.msg import JointState
 from support.ros_messages import goal, odometry, twist
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -29,7 +26,7 @@ from diffdrive_jacobian.parameters.nodes import (
     WheelBridgeParameters,
 )
 from process_faults.outcome import Outcome, unexpected
-from process_faults.worlds import finite, quiet_world
+from process_faults.worlds import OUTPUTS, finite, quiet_world
 
 NODES = {
     'virtual_robot': VirtualRobotParameters,
@@ -204,11 +201,6 @@ INPUTS: dict[str, list[tuple[str, Any]]] = {
     'virtual_robot': [('cmd_vel', twist(0.3, 0.5))],
     'go_to_goal': [('goal_pose', goal(2, 0)), ('odom', odometry(0, 0, 0))],
     'wheel_bridge': [('cmd_vel', twist(0.3, 0.5))],
-}
-OUTPUTS = {
-    'virtual_robot': (Odometry, 'odom'),
-    'go_to_goal': (Twist, 'cmd_vel'),
-    'wheel_bridge': (JointState, 'joint_command'),
 }
 
 

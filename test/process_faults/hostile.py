@@ -38,7 +38,7 @@ from support.ros_messages import (
 
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
 from process_faults.outcome import Outcome, unexpected
-from process_faults.worlds import finite, moves, quiet_world, spin
+from process_faults.worlds import OUTPUTS, finite, moves, quiet_world, spin
 
 BURST = 8
 """Messages at once; the queues of the nodes have room for 10."""
@@ -67,11 +67,6 @@ class Input(NamedTuple):
 
 STAMPED = ('-p', 'enable_stamped_cmd_vel:=true')
 SIMULATED = ('-p', 'use_sim_time:=true')
-OUTPUTS = {
-    'virtual_robot': (Odometry, 'odom'),
-    'go_to_goal': (Twist, 'cmd_vel'),
-    'wheel_bridge': (JointState, 'joint_command'),
-}
 INPUTS = (
     Input('virtual_robot', 'cmd_vel', Twist),
     Input('virtual_robot', 'cmd_vel', TwistStamped, STAMPED),
