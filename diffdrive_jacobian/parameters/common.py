@@ -32,13 +32,16 @@ _RATES = {
 """Sign, description and meaning of NaN of each limit of the acceleration."""
 
 
-def _velocity(name: str, text: str, low: float, high: float) -> Any:
-    return parameter(math.nan, text, name=name, bounds=(low, high), nan_is_none=True)
+def _velocity(name: str, text: str) -> Any:
+    bounds = (0.0, MAX_SPEED) if name.endswith('max_velocity') else (-MAX_SPEED, 0.0)
+    return parameter(math.nan, text, name=name, bounds=bounds, nan_is_none=True)
 
 
-def _acceleration(axis: str, name: str, unit: str) -> Any:
+def _acceleration(axis: str, name: str) -> Any:
     sign, what, otherwise = _RATES[name]
+    unit = 'm/s^2'
     if axis == 'angular.z':
+        unit = 'rad/s^2'
         what = what.replace('forward motion', 'counter-clockwise turns')
         what = what.replace('motion in reverse', 'clockwise turns')
         what = what.replace('forward', 'counter-clockwise').replace('in reverse', 'clockwise')
@@ -94,42 +97,27 @@ class TwistParameters(NodeParameters):
     """Type of cmd_vel, and limits of twist and acceleration."""
 
     linear_x_max_velocity: float = _velocity(
-        'linear.x.max_velocity', 'Maximum forward velocity [m/s]; .nan: no limit.', 0.0, MAX_SPEED
+        'linear.x.max_velocity', 'Maximum forward velocity [m/s]; .nan: no limit.'
     )
     linear_x_min_velocity: float = _velocity(
         'linear.x.min_velocity',
         'Minimum velocity, zero or negative: the limit in reverse [m/s]; .nan: as forward.',
-        -MAX_SPEED,
-        0.0,
     )
     angular_z_max_velocity: float = _velocity(
-        'angular.z.max_velocity',
-        'Maximum yaw rate, counter-clockwise [rad/s]; .nan: no limit.',
-        0.0,
-        MAX_SPEED,
+        'angular.z.max_velocity', 'Maximum yaw rate, counter-clockwise [rad/s]; .nan: no limit.'
     )
     angular_z_min_velocity: float = _velocity(
         'angular.z.min_velocity',
         'Minimum yaw rate, zero or negative: the limit clockwise [rad/s]; .nan: as counter-clockwise.',
-        -MAX_SPEED,
-        0.0,
     )
-    linear_x_max_acceleration: float = _acceleration('linear.x', 'max_acceleration', 'm/s^2')
-    linear_x_max_deceleration: float = _acceleration('linear.x', 'max_deceleration', 'm/s^2')
-    linear_x_max_acceleration_reverse: float = _acceleration(
-        'linear.x', 'max_acceleration_reverse', 'm/s^2'
-    )
-    linear_x_max_deceleration_reverse: float = _acceleration(
-        'linear.x', 'max_deceleration_reverse', 'm/s^2'
-    )
-    angular_z_max_acceleration: float = _acceleration('angular.z', 'max_acceleration', 'rad/s^2')
-    angular_z_max_deceleration: float = _acceleration('angular.z', 'max_deceleration', 'rad/s^2')
-    angular_z_max_acceleration_reverse: float = _acceleration(
-        'angular.z', 'max_acceleration_reverse', 'rad/s^2'
-    )
-    angular_z_max_deceleration_reverse: float = _acceleration(
-        'angular.z', 'max_deceleration_reverse', 'rad/s^2'
-    )
+    linear_x_max_acceleration: float = _acceleration('linear.x', 'max_acceleration')
+    linear_x_max_deceleration: float = _acceleration('linear.x', 'max_deceleration')
+    linear_x_max_acceleration_reverse: float = _acceleration('linear.x', 'max_acceleration_reverse')
+    linear_x_max_deceleration_reverse: float = _acceleration('linear.x', 'max_deceleration_reverse')
+    angular_z_max_acceleration: float = _acceleration('angular.z', 'max_acceleration')
+    angular_z_max_deceleration: float = _acceleration('angular.z', 'max_deceleration')
+    angular_z_max_acceleration_reverse: float = _acceleration('angular.z', 'max_acceleration_reverse')
+    angular_z_max_deceleration_reverse: float = _acceleration('angular.z', 'max_deceleration_reverse')
     enable_stamped_cmd_vel: bool = parameter(
         False, 'Use TwistStamped instead of Twist for cmd_vel. Read-only.', read_only=True
     )
