@@ -43,12 +43,7 @@ from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.covariances import from_covariance
 from diffdrive_jacobian.messages.topic_faults import GOALS_LOST, SEVERAL, UNPUBLISHED
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
-from diffdrive_jacobian.ros.graph_faults import (
-    ALTERNATION_PATIENCE,
-    Interleaving,
-    alternating_commands,
-    topic_check,
-)
+from diffdrive_jacobian.ros.graph_faults import Interleaving, topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
 from diffdrive_jacobian.ros.watchdog import command_time
@@ -92,17 +87,14 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         source, numbers = 'cmd_vel', Interleaving()
         self._commands = numbers
         if self.parameters.command_interface == 'wheels':
-            source = 'joint_command'
-            self.subscribe(
-                JointState, source, self._on_joint_command, codec=JOINT_STATE, numbers=numbers
-            )
+            source, apply = 'joint_command', partial(self._apply, self._read_joint_command)
+            self.subscribe(JointState, source, apply, codec=JOINT_STATE, numbers=numbers)
             self.watch(topic_check(self, UNPUBLISHED, source))
         else:
             stamped = self.parameters.enable_stamped_cmd_vel
             kind, codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
             apply = partial(self._apply, codec.value)
             self.subscribe(kind, source, apply, codec=codec, numbers=numbers)
-        self.watch(alternating_commands(self, source, numbers), ALTERNATION_PATIENCE)
         self.watch(topic_check(self, SEVERAL, 'odom'))
         lost = [topic_check(self, GOALS_LOST, name) for name in ('goal_pose', 'goals')]
         self.watch(lambda: next(filter(None, (check() for check in lost)), None))
@@ -133,9 +125,9 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             self._advance()
 
     def _advance(self) -> tuple[int, Robot] | None:
-        """Apply a timeout or a jump of time that happened since the last call, and return `present`.
+        """Apply a timeout or a jump of time that happened since the last call.
 
-        None: simulated time has not started.
+        Return the current time (ns) and the robot. None: simulated time has not started.
         """
         now = self.now()
         if now == 0:
@@ -161,11 +153,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         return now, robot
 
     def _present(self) -> tuple[int, Robot]:
-        """Return the current time (ns) and the robot.
-
-        Raises:
-            MessageError: Simulated time has not started.
-        """
+        """As `_advance`, but raise MessageError if simulated time has not started."""
         advanced = self._advance()
         if advanced is None:
             raise MessageError(NO_CLOCK)
@@ -205,9 +193,6 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             self._transforms.sendTransform(transform_of(self._odometry))
 
     # --- Commands
-
-    def _on_joint_command(self, *fields: Any) -> None:
-        self._apply(self._read_joint_command, *fields)
 
     def _read_joint_command(self, *fields: Any) -> Command:
         wheels = JOINT_STATE.value(*fields)

@@ -35,11 +35,13 @@ from diffdrive_jacobian.parameters.declaration import (
     changed,
 )
 from diffdrive_jacobian.ros.graph_faults import (
+    ALTERNATION_PATIENCE,
     MAX_AGE,
     TYPE_PATIENCE,
     Interleaving,
     LastingFault,
     SharedGraph,
+    alternating_commands,
     wrong_type,
 )
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
@@ -150,8 +152,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             callback: Called with the fields of each message that the codec reads, one argument each. Its
                 `value` checks them.
             codec: What is read of the messages. None: the callback receives the serialized bytes.
-            numbers: Receives the sequence number of each message before the callback is called. It
-                needs a codec.
+            numbers: Receives the sequence number of each message before the callback is called, which
+                counts those that must not alternate with those of others. It needs a codec.
 
         Raises:
             ParameterError: As for `advertise`.
@@ -163,6 +165,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         self.watch(wrong_type(self, topic, message, subscribed=True), TYPE_PATIENCE, error=True)
         if codec is not None:
             callback = decoding(message, codec.fields, callback, dropped, numbers)
+        if numbers is not None:
+            self.watch(alternating_commands(self, topic, numbers), ALTERNATION_PATIENCE)
         with explaining_failure(self, message, topic):
             return self.create_subscription(
                 message,
