@@ -35,9 +35,8 @@ from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.recording.selection import Selection
-from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
-from diffdrive_jacobian.ros.runner import Runner, discovery_off, ros_context, running
+from diffdrive_jacobian.ros.runner import NodeRunner, Runner, discovery_off, ros_context, running
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.time_units import nanoseconds

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.ros.node_runner import NodeRunner
+from diffdrive_jacobian.ros.runner import NodeRunner
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 LONGEST_STEP = 1.0

@@ -75,32 +75,11 @@ class Goal:
 
     def same_path(self, other: Goal) -> bool:
         """Return whether both are on the same path."""
-        if self.whole is None or other.whole is None or self.frame != other.frame:
+        one, two = self.whole, other.whole
+        if one is None or two is None or self.frame != other.frame:
             return False
-        one, two = (
-            (path.poses, np.zeros(0) if path.times is None else path.times)
-            for path in (self.whole, other.whole)
-        )
-        return all(map(np.array_equal, one, two))
-
-
-class GoalIdentifiers:
-    """The identifiers of the goals of one controller.
-
-    They follow from its name, the time of receipt and their number. So runs in lockstep are the same
-    each time.
-    """
-
-    def __init__(self, controller: str) -> None:
-        """Start without goals. `controller` is the fully qualified name of the node."""
-        self._controller = controller
-        self._count = 0
-
-    def info(self, stamp: Time, now: int) -> GoalInfo:
-        """Return a new identifier, with the stamp of the goal. `now` is the time of receipt (ns)."""
-        self._count += 1
-        identifier = uuid.uuid5(uuid.NAMESPACE_URL, f'{self._controller}/{now}/{self._count}')
-        return GoalInfo(goal_id=UUID(uuid=list(identifier.bytes)), stamp=stamp)
+        before, after = (np.zeros(0) if path.times is None else path.times for path in (one, two))
+        return np.array_equal(one.poses, two.poses) and np.array_equal(before, after)
 
 
 def read_goal(frame: str, frames: Sequence[str], poses: Poses) -> tuple[str, Waypoints]:
@@ -112,7 +91,7 @@ def read_goal(frame: str, frames: Sequence[str], poses: Poses) -> tuple[str, Way
         poses: The fields of each pose, as `from_pose` takes them.
 
     Raises:
-        MessageError: There is no pose, a pose is invalid, or the poses are in several frames.
+        MessageError: There is no pose, one is invalid, or they are in several frames.
     """
     if not poses:
         raise MessageError('goals must contain at least one pose, got none (to stop, call cancel_goal)')
@@ -128,15 +107,11 @@ def read_goal(frame: str, frames: Sequence[str], poses: Poses) -> tuple[str, Way
 def read_path(frame: str, frames: Sequence[str], poses: Poses, stamps: Stamps) -> tuple[str, Path]:
     """Return the frame of a path and the path, a trajectory if the stamps of the poses increase.
 
-    Args:
-        frame: Frame of the message.
-        frames: Frames of its poses; '': that of the message.
-        poses: The fields of each pose, as `from_pose` takes them.
-        stamps: `sec` and `nanosec` of each pose.
+    The arguments are those of `read_goal`, and `sec` and `nanosec` of each pose.
 
     Raises:
-        MessageError: Fewer than two positions differ, a pose is invalid, the poses are in several
-            frames, or the stamps neither increase nor are all equal.
+        MessageError: As `read_goal`. Or fewer than two positions differ, or the stamps neither increase
+            nor are all equal.
     """
     if len(poses) < 2:
         raise MessageError(
@@ -224,7 +199,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._controller = self.parameters.chosen_controller()
         self._law = self._controller.bind(self.parameters)
         self._path_law = self.parameters.chosen_path_controller().bind(self.parameters)
-        self._identifiers = GoalIdentifiers(self.get_fully_qualified_name())
+        self._goals_received = 0
         self._odom_frame = ''
         # Twist by the odometry.
         self._twist = STANDSTILL
@@ -274,15 +249,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     # --- Goals
 
     def _on_goal_pose(self, sec: int, nanosec: int, frame: str, *pose: float) -> None:
-        info = self._identifiers.info(Time(sec=sec, nanosec=nanosec), self.now())
-        self._warn_of_integers('goal_pose', [pose])
-        try:
-            goal = Goal(info, *read_goal(frame, [frame], [pose]))
-            self._match_frames(goal)
-        except MessageError as error:
-            self._refuse(info, error)
-            return
-        self._accept(goal)
+        def read(info: GoalInfo) -> Goal:
+            self._warn_of_integers('goal_pose', [pose])
+            return Goal(info, *read_goal(frame, [frame], [pose]))
+
+        self._receive(Time(sec=sec, nanosec=nanosec), read)
 
     def _on_goals(self, data: bytes) -> None:
         def read(info: GoalInfo) -> Goal:
@@ -291,7 +262,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._warn_of_integers('goals', poses)
             return Goal(info, *read_goal(frame, frames, poses))
 
-        self._receive('goals', data, Goals, MAX_WAYPOINTS, read)
+        self._receive_many('goals', data, Goals, MAX_WAYPOINTS, read)
 
     def _on_path(self, data: bytes) -> None:
         def read(info: GoalInfo) -> Goal:
@@ -301,21 +272,33 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             frame, path = read_path(frame, frames, poses, zip(secs, nanosecs, strict=True))
             return Goal(info, frame, Waypoints(path.poses), path, PathFollower(path))
 
-        self._receive('path', data, PathMessage, MAX_PATH_POSES, read)
+        self._receive_many('path', data, PathMessage, MAX_PATH_POSES, read)
 
-    def _receive(
+    def _receive_many(
         self, topic: str, data: bytes, kind: type[Any], most: int, read: Callable[[GoalInfo], Goal]
     ) -> None:
         """Accept or refuse the goal in a message with many poses, whose number is checked first."""
+
+        def read_bounded(info: GoalInfo) -> Goal:
+            if count > most:
+                raise MessageError(f'{topic} must contain at most {most} poses, got {count}')
+            return read(info)
+
         try:
             stamp, count = serialization.poses_header(data, kind)
         except MessageError as error:
             self.get_logger().warning(f'{topic} dropped: {error}', throttle_duration_sec=THROTTLE)
             return
-        info = self._identifiers.info(stamp, self.now())
+        self._receive(stamp, read_bounded)
+
+    def _receive(self, stamp: Time, read: Callable[[GoalInfo], Goal]) -> None:
+        """Accept or refuse a goal with a stamp."""
+        # Its identifier follows from this, so runs in lockstep are the same each time.
+        self._goals_received += 1
+        origin = f'{self.get_fully_qualified_name()}/{self.now()}/{self._goals_received}'
+        identifier = uuid.uuid5(uuid.NAMESPACE_URL, origin)
+        info = GoalInfo(goal_id=UUID(uuid=list(identifier.bytes)), stamp=stamp)
         try:
-            if count > most:
-                raise MessageError(f'{topic} must contain at most {most} poses, got {count}')
             goal = read(info)
             self._match_frames(goal)
         except MessageError as error:
@@ -333,7 +316,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._publish_status(info, GoalStatus.STATUS_ABORTED)
         if self._goal is not None:
             # The last latched status must be that of the active goal.
-            self._publish_status(self._goal.info, self._goal_status(self._goal))
+            executing = self._goal.executing
+            status = GoalStatus.STATUS_EXECUTING if executing else GoalStatus.STATUS_ACCEPTED
+            self._publish_status(self._goal.info, status)
 
     def _accept(self, goal: Goal) -> None:
         """Replace the active goal, if there is one. On the same path the robot goes on where it is."""
@@ -398,10 +383,6 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     def _publish_status(self, info: GoalInfo, status: int) -> None:
         self._status.publish(GoalStatus(goal_info=info, status=status))
 
-    @staticmethod
-    def _goal_status(goal: Goal) -> int:
-        return int(GoalStatus.STATUS_EXECUTING if goal.executing else GoalStatus.STATUS_ACCEPTED)
-
     # --- Control
 
     def _on_odometry(self, frame: str, v: float, omega: float, *values: float) -> None:
@@ -456,11 +437,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     def _step(
         self, goal: Goal, pose: tuple[float, float, float], now: int
     ) -> tuple[float, float] | None:
-        """Return the next command towards a goal or along its path; None: the robot has arrived.
-
-        Raises:
-            ValueError: A law failed.
-        """
+        """Return the next command towards a goal or along its path; None: the robot has arrived."""
         if goal.path is not None:
             # While the robot stands because odometry is missing, a trajectory waits.
             longest = self.parameters.odom_timeout or math.inf
@@ -489,11 +466,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         goal.path, goal.waypoints = None, Waypoints(poses, index)
 
     def _limited(self, v: float, omega: float) -> tuple[float, float]:
-        """Return a command within the limits, without whole turns between two messages.
-
-        Raises:
-            ValueError: It overflows.
-        """
+        """Return a command within the limits, without whole turns between two messages."""
         # Without wheels in the limits the geometry of the wheels does not matter.
         v, omega = scaled_to_limits.formula(v, omega, *self._limits.all(), 1.0, 1.0)
         if abs(omega) > LARGEST_TURN * self._rate:
@@ -572,10 +545,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._cmd_vel.publish(command)
 
     def _on_other_driver(self, names: str) -> None:
-        """Cancel the goal and stop the robot: whoever drives by hand takes over.
-
-        Without the zero the robot might follow the last command of this node, not of the other one.
-        """
+        """Cancel the goal: whoever drives by hand takes over."""
+        # The zero of `_end`: or the robot might follow the last command of this node.
         topic = self._cmd_vel.topic_name
         self.log_event_warning(
             'other driver',

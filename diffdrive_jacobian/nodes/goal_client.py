@@ -35,13 +35,10 @@ from diffdrive_jacobian.messages.conversion import MessageError, from_pose, from
 from diffdrive_jacobian.messages.goal_follower import GoalFollower
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.names import is_named, node_of
-from diffdrive_jacobian.ros.node import THROTTLE
+from diffdrive_jacobian.ros.node import THROTTLE, explaining_failure
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
-from diffdrive_jacobian.ros.topic_errors import explaining_failure
 from diffdrive_jacobian.time_units import nanoseconds
 
-SILENCE = 3.0
-"""A controller that has not answered for this long was killed or hangs (s)."""
 DRIVEN_POINT_PARAMETERS = ('controller', 'offset')
 """Parameters of a controller that determine which point of the robot it drives."""
 MESSAGES: dict[str, type] = {'goal_pose': PoseStamped, 'goals': Goals, 'path': PathMessage}
@@ -88,14 +85,9 @@ def goals_message(
     times: NDArray[np.float64] | None = None,
     frame: str = '',
 ) -> Any:
-    """Return the message with goals for a topic.
+    """Return the message for a topic of `MESSAGES` with goals, shape (n, 3) (m, m, rad).
 
-    Args:
-        topic: One of `MESSAGES`. goal_pose takes one goal.
-        goals: `[x, y, theta]` of each, shape (n, 3) (m, m, rad).
-        now: Stamp of the message (ns).
-        times: Times of the poses of a trajectory since the stamp, shape (n) (s). None: without stamps.
-        frame: Frame of the goals.
+    `now` is its stamp (ns). `times`, shape (n) (s), are those of the poses of a trajectory since then.
     """
     poses = [PoseStamped() for _ in goals]
     for pose, goal in zip(poses, goals, strict=True):
@@ -268,14 +260,7 @@ class GoalClient(Node):  # type: ignore[misc]
         return str(self._canceling.result().message) if answered else ''
 
     def confirmed(self, timeout: float) -> bool:
-        """Wait until the goals are acknowledged by every subscription.
-
-        Args:
-            timeout: Longest wait (s).
-
-        Returns:
-            Whether they are.
-        """
+        """Wait for a time (s) until the goals are acknowledged by all; return whether they are."""
         acknowledged: bool = self._publisher.wait_for_all_acked(Duration(seconds=timeout))
         return acknowledged
 
@@ -292,10 +277,6 @@ class GoalClient(Node):  # type: ignore[misc]
             bytes(info.endpoint_gid): node_of(info) if is_named(info) else ''
             for info in self.get_publishers_info_by_topic(topic)
         }
-
-    def set_controller_parameters(self, values: Mapping[str, Any]) -> None:
-        """Set the point that is to arrive from the controller's `DRIVEN_POINT_PARAMETERS`."""
-        self.arrival = Arrival(offset=driven_offset(values))
 
     def obstacle(self) -> str | None:
         """Describe what is missing before goals can be sent. None: nothing."""
@@ -340,10 +321,9 @@ class GoalClient(Node):  # type: ignore[misc]
 
 
 def driven_offset(values: Mapping[str, Any]) -> float:
-    """Return x of the point that a controller drives, in the body frame (m). 0: the axle centre.
+    """Return x of the point that a controller with these `DRIVEN_POINT_PARAMETERS` drives (m).
 
-    Args:
-        values: Values of `DRIVEN_POINT_PARAMETERS`, of any node. Invalid values count as missing.
+    It is in the body frame; 0: the axle centre. Invalid values, of any node, count as missing.
     """
     offset = values.get('offset')
     if values.get('controller') != 'offset_point' or not isinstance(offset, float):
@@ -354,49 +334,3 @@ def driven_offset(values: Mapping[str, Any]) -> float:
 def _nodes(endpoints: Iterable[Any]) -> set[str]:
     """Return the names of the nodes of endpoints, as far as they are known."""
     return {node_of(endpoint) for endpoint in endpoints if is_named(endpoint)}
-
-
-def loss(
-    sent_to: Mapping[bytes, str],
-    present: Mapping[bytes, str],
-    silence: float,
-    partial_silence: Mapping[str, float],
-) -> str | None:
-    """Describe why the controller of a goal is lost. None: it is not.
-
-    Args:
-        sent_to: The controllers to which the goal was sent, as from `GoalClient.controllers`.
-        present: The controllers that are present now.
-        silence: Time since any of them answered (s).
-        partial_silence: For how long fewer nodes of each name have answered than the graph lists (s).
-    """
-    namesakes = _namesakes(sent_to, present)
-    if not sent_to.keys() & present.keys():
-        if namesakes:
-            return f'the controller {namesakes[0]} was restarted'
-        return 'the controller is gone'
-    if silence >= SILENCE:
-        names = ', '.join(sorted(set(sent_to.values()) - {''}))
-        return f'the controller {names} has not answered for {SILENCE:g} s: it was killed or hangs'
-    # DDS may list one that was killed for 20 s more, beside its successor, which answers alone.
-    for name in namesakes:
-        if partial_silence.get(name, 0.0) >= SILENCE:
-            return f'the controller {name} was restarted'
-    return None
-
-
-def duplicates(sent_to: Mapping[bytes, str], present: Mapping[bytes, str]) -> list[str]:
-    """Return the names of controllers of a goal that other nodes have as well, sorted.
-
-    Args:
-        sent_to: The controllers to which the goal was sent, as from `GoalClient.controllers`.
-        present: The controllers that are present now.
-    """
-    remaining = {gid: name for gid, name in sent_to.items() if gid in present}
-    return [name for name in _namesakes(sent_to, present) if name in remaining.values()]
-
-
-def _namesakes(sent_to: Mapping[bytes, str], present: Mapping[bytes, str]) -> list[str]:
-    """Return the names that later controllers share with those of the goal, sorted."""
-    later = {present[gid] for gid in present.keys() - sent_to.keys()}
-    return sorted(later & set(sent_to.values()) - {''})

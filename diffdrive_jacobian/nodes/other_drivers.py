@@ -34,7 +34,7 @@ class OtherDrivers:
         Args:
             node: The node.
             publisher: Its publisher of commands, Twist or TwistStamped.
-            callback: Receives the names of the other nodes that publish commands.
+            callback: Receives the names of the other nodes.
         """
         self._node = node
         self._graph = SharedGraph(node)

@@ -7,29 +7,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.control import Path
+from diffdrive_jacobian.control import Arrival, Path
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.nodes import standstill
-from diffdrive_jacobian.nodes.goal_client import (
-    DRIVEN_POINT_PARAMETERS,
-    SILENCE,
-    GoalClient,
-    duplicates,
-    loss,
-)
-from diffdrive_jacobian.nodes.standstill import Standstill
+from diffdrive_jacobian.nodes.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, driven_offset
 from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
-from diffdrive_jacobian.ros.liveness import Liveness
-from diffdrive_jacobian.ros.node_runner import NodeRunner
-from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.ros.runner import NodeRunner, ros_context, running
+from diffdrive_jacobian.ros.service_client import Liveness
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 
@@ -45,8 +36,14 @@ PARAMETER_PATIENCE = 1.0
 """Longest time in which a controller may report its parameters (s)."""
 DISCOVERY_PERIOD = 1.0
 """Time between two queries of the publishers of goal_status (s)."""
-
-
+SILENCE = 3.0
+"""A controller that has not answered for this long was killed or hangs (s)."""
+STANDSTILL_PATIENCE = 5.0
+"""Time without motion after which a robot stands still (s)."""
+MIN_DISTANCE = 0.005
+"""Smallest displacement that is motion (m): more than the noise of odometry at rest."""
+MIN_ROTATION = 0.01
+"""Smallest rotation that is motion (rad)."""
 HEADING_PARAMETERS = (*DRIVEN_POINT_PARAMETERS, 'use_goal_heading')
 """Parameters of a controller that also determine whether it takes the heading of a goal."""
 
@@ -108,8 +105,8 @@ class GoalResult:
         return self.result is Result.INTERRUPTED
 
 
-class RemoteProgress(Protocol):
-    """Receives the progress of a goal."""
+class RemoteProgress:
+    """Receives the progress of a goal. This one ignores it."""
 
     def waiting(self, reason: str) -> None:
         """Receive what is waited for, many times a second."""
@@ -127,28 +124,10 @@ class RemoteProgress(Protocol):
         """Receive that the robot has not moved for so long (s) with the goal, once per standstill."""
 
 
-class _Silent:
-    """A progress that is not shown."""
-
-    def waiting(self, reason: str) -> None:
-        pass
-
-    def heading_ignored(self, controller: str) -> None:
-        pass
-
-    def driving(self, distance: float) -> None:
-        pass
-
-    def no_odometry(self, topic: str, seconds: float) -> None:
-        pass
-
-    def standing(self, seconds: float) -> None:
-        pass
-
-
 def send_goal(
-    goal: ArrayLike,
+    goal: ArrayLike | Path,
     *,
+    relative: bool = False,
     runner: NodeRunner | None = None,
     frame: str = '',
     readers: int = 1,
@@ -160,14 +139,16 @@ def send_goal(
     signals: Signals | None = None,
     progress: RemoteProgress | None = None,
 ) -> GoalResult:
-    """Send a goal to a controller in another process, and follow it until it has ended.
+    """Send a goal or a path to a controller in another process, and follow it until it has ended.
 
     Args:
-        goal: `[x, y, theta]`, shape (3,) (m, m, rad).
+        goal: `[x, y, theta]`, shape (3,) (m, m, rad), or a path; with times a trajectory.
+        relative: Whether the coordinates are those in the body frame of the robot where it is now.
+            Otherwise they are in `frame`.
         runner: Runs the node until the goal has ended, in real time (`drives.in_real_time`) or in
             lockstep (`drives.in_lockstep`), and may run others. None: a new one does.
         frame: Frame of the goal. Empty: the frame of the odometry.
-        readers: Number of subscriptions that goal_pose must have before the goal is sent.
+        readers: Number of subscriptions that the topic must have before the goal is sent.
         patience: Longest wait for the controller and for the subscriptions (s).
         timeout: Time after which the goal is canceled (s).
         follow: Whether to wait for the end. Otherwise for the acknowledgement only.
@@ -175,88 +156,27 @@ def send_goal(
         ros_arguments: ROS arguments of the node; those of `runner`, if it is given.
         signals: Counter of the signals that cancel the goal. None: no signal does.
         progress: Receives the progress. An error that it raises cancels the goal, and is passed on.
-            None: nothing does.
 
     Raises:
         UserError: The ROS arguments are invalid, or the node cannot be created.
-        ValueError: `goal` has another shape, a time is not positive, or `ros_arguments` are given with
-            `runner`.
+        ValueError: `goal` has another shape, a path more than 10,000 poses, a time is not positive, or
+            `ros_arguments` are given with `runner`.
     """
-    goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
-    sending = _Sending(frame, readers, patience, timeout, follow, heading_matters)
-    return _send(NAME, goals, sending, runner, ros_arguments, signals, progress)
-
-
-def send_path(
-    path: Path,
-    *,
-    relative: bool = False,
-    runner: NodeRunner | None = None,
-    frame: str = '',
-    readers: int = 1,
-    patience: float = PATIENCE,
-    timeout: float = math.inf,
-    follow: bool = True,
-    ros_arguments: Sequence[str] = (),
-    signals: Signals | None = None,
-    progress: RemoteProgress | None = None,
-) -> GoalResult:
-    """Send a path to a controller in another process, and follow it until it has ended.
-
-    Args:
-        path: The path; with times a trajectory.
-        relative: Whether its coordinates are those in the body frame of the robot where it is now.
-            Otherwise they are in `frame`.
-        runner: As for `send_goal`.
-        frame: Likewise.
-        readers: Number of subscriptions that path must have before it is sent.
-        patience: As for `send_goal`.
-        timeout: Likewise.
-        follow: Likewise.
-        ros_arguments: Likewise.
-        signals: Likewise.
-        progress: Likewise.
-
-    Raises:
-        UserError: The ROS arguments are invalid, or the node cannot be created.
-        ValueError: The path has more than 10,000 poses, a time is not positive, or `ros_arguments` are
-            given with `runner`.
-    """
-    if len(path.poses) > MAX_PATH_POSES:
-        raise ValueError(f'path must have at most {MAX_PATH_POSES} poses, got {len(path.poses)}')
-    sending = _Sending(frame, readers, patience, timeout, follow, relative=relative)
-    return _send(PATH_NAME, path, sending, runner, ros_arguments, signals, progress)
-
-
-class _Sending(NamedTuple):
-    """How goals are sent: arguments of `send_goal` and `send_path`."""
-
-    frame: str
-    readers: int
-    patience: float
-    timeout: float
-    follow: bool
-    heading_matters: bool = False
-    relative: bool = False
-
-
-def _send(
-    name: str,
-    goals: NDArray[np.float64] | Path,
-    how: _Sending,
-    runner: NodeRunner | None,
-    ros_arguments: Sequence[str],
-    signals: Signals | None,
-    progress: RemoteProgress | None,
-) -> GoalResult:
-    number('patience', how.patience, positive_or_infinite)
-    number('timeout', how.timeout, positive_or_infinite)
+    goals: NDArray[np.float64] | Path
+    if isinstance(goal, Path):
+        if len(goal.poses) > MAX_PATH_POSES:
+            raise ValueError(f'path must have at most {MAX_PATH_POSES} poses, got {len(goal.poses)}')
+        name, goals = PATH_NAME, goal
+    else:
+        name, goals = NAME, np.asarray(goal, dtype=np.float64)[np.newaxis]
+    number('patience', patience, positive_or_infinite)
+    number('timeout', timeout, positive_or_infinite)
     if runner is not None and ros_arguments:
         raise ValueError('ros_arguments are those of the runner, if one is given')
     created = runner is None
     with ExitStack() as stack:
         if runner is None:
-            if not how.follow:
+            if not follow:
                 # The acknowledgement is what is waited for.
                 stack.enter_context(fast_heartbeats())
             context = stack.enter_context(ros_context([name, *ros_arguments]))
@@ -268,20 +188,18 @@ def _send(
                 goals,
                 used.context,
                 topic='goal_pose',
-                relative=how.relative,
-                frame=how.frame,
-                readers=how.readers,
+                relative=relative,
+                frame=frame,
+                readers=readers,
                 monotonic=used.seconds,
                 start_parameter_services=False,
             )
         )
         if not created:
             stack.callback(used.remove, client)
-        session = _Session(client, used, signals or Signals(), progress or _Silent())
+        session = _Session(client, used, signals or Signals(), progress or RemoteProgress())
         try:
-            return session.run(
-                how.patience, how.timeout, follow=how.follow, heading_matters=how.heading_matters
-            )
+            return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
         except BaseException:
             session.abandon()
             raise
@@ -351,13 +269,7 @@ class _Session:
     ) -> str | None:
         """Wait until nothing is missing, for a time (s) or until a signal, and report what is.
 
-        Args:
-            seconds: Longest time (s).
-            missing: Returns what is missing; None: nothing.
-            liveness: Sends requests meanwhile.
-
-        Returns:
-            What is missing at the end; None: nothing.
+        Return what is missing at the end; None: nothing. `liveness` sends requests meanwhile.
         """
         reason = None
         for _ in self._turns(seconds):
@@ -403,15 +315,14 @@ class _Session:
     def _use(self, liveness: Liveness) -> None:
         """Use the parameters that the first controller has reported last."""
         for name in sorted(liveness.values)[:1]:
-            self._client.set_controller_parameters(liveness.values[name])
+            self._client.arrival = Arrival(offset=driven_offset(liveness.values[name]))
 
     def _follow(
         self, liveness: Liveness, controllers: Mapping[bytes, str], timeout: float
     ) -> str | None:
         """Wait until the goal has ended, for a time (s) or until a signal.
 
-        Returns:
-            Why the controller is lost. None: it is not.
+        Return why the controller is lost; None: it is not.
         """
         client = self._client
         topic = client.resolve_topic_name('odom')
@@ -433,7 +344,7 @@ class _Session:
                 if client.status is not GoalState.EXECUTING:
                     motion.reset()
                 elif motion.update(client.robot.pose, now):
-                    self._progress.standing(standstill.PATIENCE)
+                    self._progress.standing(STANDSTILL_PATIENCE)
             if client.ended:
                 break
             if now - queried >= DISCOVERY_PERIOD:
@@ -499,10 +410,9 @@ class _Session:
 
 
 def ignores_heading(values: Mapping[str, Any]) -> bool:
-    """Return whether a controller ignores the heading of goals.
+    """Return whether a controller with these `HEADING_PARAMETERS` ignores the heading of goals.
 
-    Args:
-        values: Values of its `HEADING_PARAMETERS`. Other controllers than the built-in ones may take it.
+    Other controllers than the built-in ones may take it.
     """
     controller = BUILT_IN.get(str(values.get('controller')))
     return (
@@ -510,3 +420,73 @@ def ignores_heading(values: Mapping[str, Any]) -> bool:
         and controller is not None
         and not controller.takes_heading
     )
+
+
+def loss(
+    sent_to: Mapping[bytes, str],
+    present: Mapping[bytes, str],
+    silence: float,
+    partial_silence: Mapping[str, float],
+) -> str | None:
+    """Describe why the controller of a goal is lost. None: it is not.
+
+    Args:
+        sent_to: The controllers to which the goal was sent, as from `GoalClient.controllers`.
+        present: The controllers that are present now.
+        silence: As of `Liveness`.
+        partial_silence: Likewise.
+    """
+    namesakes = _namesakes(sent_to, present)
+    if not sent_to.keys() & present.keys():
+        if namesakes:
+            return f'the controller {namesakes[0]} was restarted'
+        return 'the controller is gone'
+    if silence >= SILENCE:
+        names = ', '.join(sorted(set(sent_to.values()) - {''}))
+        return f'the controller {names} has not answered for {SILENCE:g} s: it was killed or hangs'
+    # DDS may list one that was killed for 20 s more, beside its successor, which answers alone.
+    for name in namesakes:
+        if partial_silence.get(name, 0.0) >= SILENCE:
+            return f'the controller {name} was restarted'
+    return None
+
+
+def duplicates(sent_to: Mapping[bytes, str], present: Mapping[bytes, str]) -> list[str]:
+    """Return the names of controllers of a goal that other nodes have as well, sorted."""
+    remaining = {gid: name for gid, name in sent_to.items() if gid in present}
+    return [name for name in _namesakes(sent_to, present) if name in remaining.values()]
+
+
+def _namesakes(sent_to: Mapping[bytes, str], present: Mapping[bytes, str]) -> list[str]:
+    """Return the names that later controllers share with those of the goal, sorted."""
+    later = {present[gid] for gid in present.keys() - sent_to.keys()}
+    return sorted(later & set(sent_to.values()) - {''})
+
+
+class Standstill:
+    """Detects, from the poses of a robot, that it has not moved for `STANDSTILL_PATIENCE`."""
+
+    def __init__(self) -> None:
+        """Start without a pose."""
+        self._reference: NDArray[np.float64] | None = None
+        self._since = 0.0
+        self._detected = False
+
+    def reset(self) -> None:
+        """Forget the poses: the robot is not expected to move."""
+        self._reference = None
+
+    def update(self, pose: NDArray[np.float64], now: float) -> bool:
+        """Return whether a robot with a pose at a time (s) stands still, once for each standstill."""
+        if self._reference is None or _moved(pose - self._reference):
+            self._reference, self._since, self._detected = pose, now, False
+            return False
+        if self._detected or now - self._since < STANDSTILL_PATIENCE:
+            return False
+        self._detected = True
+        return True
+
+
+def _moved(difference: NDArray[np.float64]) -> bool:
+    x, y, theta = (float(value) for value in difference)
+    return math.hypot(x, y) > MIN_DISTANCE or abs(math.remainder(theta, math.tau)) > MIN_ROTATION

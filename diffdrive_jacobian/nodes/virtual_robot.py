@@ -7,6 +7,7 @@ The unicycle model is integrated exactly. The motion depends on the commands and
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,7 +19,7 @@ from geometry_msgs.msg import (
     TwistStamped,
 )
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from rclpy.clock import JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -41,18 +42,14 @@ from diffdrive_jacobian.messages.codecs import (
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.covariances import from_covariance
 from diffdrive_jacobian.messages.topic_faults import GOALS_LOST, SEVERAL, UNPUBLISHED
-from diffdrive_jacobian.nodes.command_time import command_time
-from diffdrive_jacobian.nodes.robot_defects import RobotDefects
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
-from diffdrive_jacobian.ros.graph_faults import (
-    ALTERNATION_PATIENCE,
-    Interleaving,
-    alternating_commands,
-    topic_check,
-)
+from diffdrive_jacobian.ros.graph_faults import Interleaving, topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
-from diffdrive_jacobian.simulation.robot import Robot
+from diffdrive_jacobian.ros.watchdog import command_time
+from diffdrive_jacobian.simulation.encoders import Encoders
+from diffdrive_jacobian.simulation.robot import Robot, RobotModel
+from diffdrive_jacobian.simulation.slip import Drift
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds, seconds
 
@@ -73,8 +70,9 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         """Create the robot at its initial pose. `kwargs` as for `ParameterizedNode`."""
         super().__init__('virtual_robot', VirtualRobotParameters, **kwargs)
         self._robot: Robot | None = None
+        """The robot at the last event. None: simulated time has not started."""
         self._latest = 0
-        self.defects = RobotDefects(self._advance, self._remodel, self._move, self._set_pose)
+        self.defects = RobotDefects(self)
         """What is wrong with the robot beyond its parameters, for tests."""
         self._configure()
         self._odom = self.advertise(Odometry, 'odom')
@@ -89,17 +87,14 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         source, numbers = 'cmd_vel', Interleaving()
         self._commands = numbers
         if self.parameters.command_interface == 'wheels':
-            source = 'joint_command'
-            self.subscribe(
-                JointState, source, self._on_joint_command, codec=JOINT_STATE, numbers=numbers
-            )
+            source, apply = 'joint_command', partial(self._apply, self._read_joint_command)
+            self.subscribe(JointState, source, apply, codec=JOINT_STATE, numbers=numbers)
             self.watch(topic_check(self, UNPUBLISHED, source))
         else:
             stamped = self.parameters.enable_stamped_cmd_vel
             kind, codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
             apply = partial(self._apply, codec.value)
             self.subscribe(kind, source, apply, codec=codec, numbers=numbers)
-        self.watch(alternating_commands(self, source, numbers), ALTERNATION_PATIENCE)
         self.watch(topic_check(self, SEVERAL, 'odom'))
         lost = [topic_check(self, GOALS_LOST, name) for name in ('goal_pose', 'goals')]
         self.watch(lambda: next(filter(None, (check() for check in lost)), None))
@@ -132,8 +127,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     def _advance(self) -> tuple[int, Robot] | None:
         """Apply a timeout or a jump of time that happened since the last call.
 
-        Returns:
-            The current time (ns) and the robot. None: simulated time has not started.
+        Return the current time (ns) and the robot. None: simulated time has not started.
         """
         now = self.now()
         if now == 0:
@@ -152,12 +146,18 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             robot = robot.at(self._latest).restarted(now)
             self._publish_start(robot)
             self._publish_applied(robot)
-        else:
-            if robot.expiry is not None and robot.expiry <= now:
-                robot = robot.at(robot.expiry)
-                self._publish_applied(robot)
+        elif robot.expiry is not None and robot.expiry <= now:
+            robot = robot.at(robot.expiry)
+            self._publish_applied(robot)
         self._robot, self._latest = robot, now
         return now, robot
+
+    def _present(self) -> tuple[int, Robot]:
+        """As `_advance`, but raise MessageError if simulated time has not started."""
+        advanced = self._advance()
+        if advanced is None:
+            raise MessageError(NO_CLOCK)
+        return advanced
 
     def _publish_start(self, robot: Robot) -> None:
         """Publish the pose and the time at which the odometry starts."""
@@ -194,9 +194,6 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     # --- Commands
 
-    def _on_joint_command(self, *fields: Any) -> None:
-        self._apply(self._read_joint_command, *fields)
-
     def _read_joint_command(self, *fields: Any) -> Command:
         wheels = JOINT_STATE.value(*fields)
         speeds = wheels.speeds(self.parameters.wheel_names)
@@ -206,17 +203,9 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         return Command(messages.plausible_twist(v, omega), wheels.stamp)
 
     def _apply(self, read: Callable[..., Command], *fields: Any) -> None:
-        """Apply a command, or log why it is dropped.
-
-        Args:
-            read: Returns the command in the fields of a message.
-            fields: The fields.
-        """
-        advanced = self._advance()
+        """Apply the command that `read` returns for the fields, or log why it is dropped."""
         try:
-            if advanced is None:
-                raise MessageError(NO_CLOCK)
-            now, robot = advanced
+            now, robot = self._present()
             twist, stamp = read(*fields)
             timeout = robot.model.command_timeout
             time = command_time(stamp, now, robot.stamp, timeout)
@@ -236,12 +225,10 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     # --- Pose
 
     def _on_initial_pose(self, sec: int, nanosec: int, frame: str, *values: Any) -> None:
-        advanced = self._advance()
         ours = self.parameters.odom_frame_id
         self.warn_of_integers('initialpose', *values[:6])
         try:
-            if advanced is None:
-                raise MessageError(NO_CLOCK)
+            now, robot = self._present()
             if frame not in ('', ours):
                 raise MessageError(f"its frame must be '{printable(ours)}', got '{printable(frame)}'")
             # Its stamp does not matter: the robot is placed when the message is received.
@@ -250,25 +237,21 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         except MessageError as error:
             self.get_logger().warning(f'initialpose dropped: {error}', throttle_duration_sec=THROTTLE)
             return
-        now, robot = advanced
-        self._set_pose(robot.placed(pose, covariance, now))
+        self._place(robot.placed(pose, covariance, now))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        advanced = self._advance()
-        if advanced is None:
-            response.message = NO_CLOCK
+        try:
+            now, robot = self._present()
+        except MessageError as error:
+            response.message = str(error)
             return response
-        now, robot = advanced
-        covariance = np.zeros((3, 3))
-        self._set_pose(robot.placed(self._initial_pose(), covariance, now, odometry_only=True))
+        self._place(robot.placed(self._initial_pose(), np.zeros((3, 3)), now, odometry_only=True))
         response.success, response.message = True, f'odometry was reset to {self._initial_pose()}'
         return response
 
-    def _move(self, robot: Robot) -> None:
+    def _place(self, robot: Robot) -> None:
+        """Replace the robot, whose odometry starts again at its pose."""
         self._robot = robot
-
-    def _set_pose(self, robot: Robot) -> None:
-        self._move(robot)
         self.defects.placed(robot)
         self._publish_start(robot)
         x, y, theta = robot.pose
@@ -355,3 +338,106 @@ def transform_of(odometry: Odometry) -> TransformStamped:
     translation.x, translation.y = position.x, position.y
     message.transform.rotation = odometry.pose.pose.orientation
     return message
+
+
+class RobotDefects:
+    """What is wrong with a virtual robot beyond its parameters, for tests: changes of its model, coarse
+    encoders, and pushes.
+
+    From the first one on after which the true pose may differ from the odometry, the model has a drift,
+    and the robot publishes `ground_truth`.
+    """
+
+    def __init__(self, node: VirtualRobot) -> None:
+        """Start with a robot that is in order."""
+        self._node = node
+        self._changes: list[Callable[[RobotModel], RobotModel]] = []
+        self._encoders: Encoders | None = None
+        self._has_truth = False
+
+    def model(self, nominal: RobotModel) -> RobotModel:
+        """Return the model of the robot, given that of its parameters."""
+        for change in self._changes:
+            nominal = change(nominal)
+        if nominal.drift is not None:
+            self._has_truth = True
+        elif self._has_truth:
+            # The true pose is not forgotten.
+            return replace(nominal, drift=Drift())
+        return nominal
+
+    def change(self, change: Callable[[RobotModel], RobotModel]) -> Callable[[], None]:
+        """Change the model from now on, and return a function that ends the change.
+
+        Several changes apply in the order of the calls.
+        """
+        self._changes.append(change)
+        self._node._remodel()
+
+        def end() -> None:
+            self._changes.remove(change)
+            self._node._remodel()
+
+        return end
+
+    def push(self, displacement: ArrayLike, *, noticed: bool = False) -> None:
+        """Displace the robot now, without turning its wheels.
+
+        Args:
+            displacement: `[dx, dy, dtheta]` in the body frame, shape (3,) (m, m, rad).
+            noticed: Whether the odometry follows, as if corrected by a localisation.
+
+        Raises:
+            ValueError: The displacement is invalid.
+            MessageError: Simulated time has not started.
+        """
+        if not noticed:
+            self._know_truth()
+        now, robot = self._node._present()
+        pushed = robot.pushed(displacement, now, noticed=noticed)
+        if noticed:
+            self._node._place(pushed)
+        else:
+            self._node._robot = pushed
+
+    # --- Encoders
+
+    def set_encoders(self, per_revolution: int | None) -> None:
+        """Report what encoders of so many increments per turn of a wheel count; None: exact angles.
+
+        The odometry goes on from its present pose.
+
+        Raises:
+            ValueError: It is not a positive integer.
+            MessageError: Simulated time has not started.
+        """
+        self._know_truth()
+        now, robot = self._node._present()
+        encoders, robot = self._encoders, robot.at(now)
+        if per_revolution is not None:
+            self._encoders = Encoders.at(robot, per_revolution)
+        elif encoders is not None:
+            self._encoders = None
+            pose = encoders.read(robot).pose
+            self._node._place(robot.placed(pose, robot.covariance, now, odometry_only=True))
+
+    def reported(self, robot: Robot) -> Robot:
+        """Read the encoders, and return the robot as they report it."""
+        if self._encoders is None:
+            return robot
+        self._encoders = self._encoders.read(robot)
+        return self._encoders.reported(robot)
+
+    def odometry_pose(self, robot: Robot) -> NDArray[np.float64]:
+        """Return `[x, y, theta]` of the odometry, shape (3,), by the last reading of encoders."""
+        return np.array(robot.pose_tuple if self._encoders is None else self._encoders.pose)
+
+    def placed(self, robot: Robot) -> None:
+        """Start the odometry again at the pose of the robot."""
+        if self._encoders is not None:
+            self._encoders = self._encoders.read(robot).placed(robot.pose_tuple)
+
+    def _know_truth(self) -> None:
+        """Compute the true pose besides that of the odometry from now on."""
+        self._has_truth = True
+        self._node._remodel()

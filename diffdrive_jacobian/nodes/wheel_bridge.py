@@ -19,17 +19,11 @@ from diffdrive_jacobian.messages.codecs import (
 )
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.topic_faults import UNREAD
-from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
-from diffdrive_jacobian.ros.graph_faults import (
-    ALTERNATION_PATIENCE,
-    Interleaving,
-    alternating_commands,
-    topic_check,
-)
+from diffdrive_jacobian.ros.graph_faults import Interleaving, topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import restart_timer
-from diffdrive_jacobian.ros.watchdog import Watchdog
+from diffdrive_jacobian.ros.watchdog import Watchdog, command_time
 from diffdrive_jacobian.simulation.actuators import ramp
 from diffdrive_jacobian.simulation.robot import STANDSTILL
 from diffdrive_jacobian.simulation.speeds import Profile
@@ -57,13 +51,12 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             JointState if as_joints else Float64MultiArray, 'joint_command'
         )
         self._configure()
-        self._commands = numbers = Interleaving()
+        self._commands = Interleaving()
         stamped = parameters.enable_stamped_cmd_vel
         kind, self._codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
-        self.subscribe(kind, 'cmd_vel', self._on_command, codec=self._codec, numbers=numbers)
+        self.subscribe(kind, 'cmd_vel', self._on_command, codec=self._codec, numbers=self._commands)
         readers = self._joint_command.get_subscription_count
         self.watch(topic_check(self, UNREAD, 'joint_command', readers))
-        self.watch(alternating_commands(self, 'cmd_vel', numbers), ALTERNATION_PATIENCE)
         self._last = 0
         self._twist = self._target = STANDSTILL
         # From the last command on, with limits of the acceleration.
@@ -92,13 +85,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         self._follow((v, omega), self._last, now)
 
     def _follow(self, command: tuple[float, float], stamp: int, now: int) -> None:
-        """Publish the speeds of a command, or start to approach them within the limits.
-
-        Args:
-            command: The twist.
-            stamp: The time of the message without limits of the acceleration (ns).
-            now: Current time (ns).
-        """
+        """Publish the speeds of a twist with a stamp, or start to approach them within the limits."""
         self._target = target = self._model.limited(command)
         if self._acceleration.unlimited:
             self._profile = None

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.numerics import fields
@@ -34,15 +34,24 @@ class ParameterError(DiffdriveError, ValueError):
 class Specification:
     """Properties of a parameter other than its type and its default."""
 
-    name: str | None
     description: str
-    low: float | None
-    high: float | None
-    above: float | None
-    choices: Collection[str]
-    constraint: str
-    nan_is_none: bool
-    read_only: bool
+    """One sentence with the unit in brackets."""
+    name: str | None = None
+    """ROS name, if it differs from the name of the field (`linear.x.max_velocity`)."""
+    low: float | None = None
+    """Smallest value allowed."""
+    high: float | None = None
+    """Largest value allowed."""
+    above: float | None = None
+    """Lower bound that is itself not allowed."""
+    choices: Collection[str] = ()
+    """The strings allowed."""
+    constraint: str = ''
+    """Text for the descriptor instead of the list of choices, where these are searched for."""
+    nan_is_none: bool = False
+    """Whether NaN is allowed and means "none". Ranges of ROS reject NaN, so its descriptor has none."""
+    read_only: bool = False
+    """Whether the parameter cannot change while the node runs."""
 
     @property
     def allowed(self) -> str:
@@ -82,40 +91,21 @@ def parameter(
     default: Any,
     description: str,
     *,
-    name: str | None = None,
     bounds: tuple[float, float] | None = None,
     above: float | None = None,
-    choices: Collection[str] = (),
-    constraint: str = '',
-    nan_is_none: bool = False,
-    read_only: bool = False,
+    **others: Any,
 ) -> Any:
     """Declare a field of a `NodeParameters` class.
 
     Args:
         default: Default value; bool, int, float or str.
-        description: One sentence with the unit in brackets.
-        name: ROS name, if it differs from the name of the field (`linear.x.max_velocity`).
-        bounds: Smallest and largest value allowed.
+        description: As in `Specification`, as the other arguments.
+        bounds: `low` and `high`.
         above: Lower bound that is itself not allowed, besides `bounds`.
-        choices: The strings allowed.
-        constraint: Text for the descriptor instead of the list of choices, where these are searched for.
-        nan_is_none: Whether NaN is allowed and means "none". Ranges of ROS reject NaN, so the descriptor
-            of such a parameter has no range.
-        read_only: Whether the parameter cannot change while the node runs.
+        others: Further fields of the `Specification`.
     """
     low, high = bounds or ((None, None) if above is None else (-math.inf, math.inf))
-    specification = Specification(
-        name=name,
-        description=description,
-        low=low,
-        high=high,
-        above=above,
-        choices=choices,
-        constraint=constraint,
-        nan_is_none=nan_is_none,
-        read_only=read_only,
-    )
+    specification = Specification(description=description, low=low, high=high, above=above, **others)
     return dataclasses.field(default=default, metadata={'parameter': specification})
 
 
@@ -136,8 +126,7 @@ class NodeParameters:
             value, wanted = getattr(self, field), type(default_of(type(self), field))
             if type(value) is not wanted:
                 raise ParameterError(
-                    f"parameter '{name}' must be {_TYPE_NAMES[wanted]}"
-                    f'{_example(wanted)}, got {_got(value)}'
+                    f"parameter '{name}' must be {_TYPE_NAMES[wanted]}, got {_got(value)}"
                 )
             if not specification.permits(value):
                 raise ParameterError(
@@ -150,10 +139,7 @@ class NodeParameters:
 
     @classmethod
     def extended(cls: type[P], values: Mapping[str, Any]) -> type[P]:
-        """Return the class of parameters that is needed for some values, by their ROS names.
-
-        For subclasses: other parameters may be needed where one has another value.
-        """
+        """Return the class with the parameters that others with these values, by ROS name, need."""
         return cls
 
 
@@ -165,12 +151,12 @@ def _got(value: object) -> str:
     return f"'{printable(value)}'{length}"
 
 
-_TYPE_NAMES = {bool: 'a bool', int: 'an integer', float: 'a double', str: 'a string'}
-
-
-def _example(wanted: type) -> str:
-    examples: dict[type, str] = {bool: ' (true or false)', float: ' (as 1.0)'}
-    return examples.get(wanted, '')
+_TYPE_NAMES = {
+    bool: 'a bool (true or false)',
+    int: 'an integer',
+    float: 'a double (as 1.0)',
+    str: 'a string',
+}
 
 
 def specifications(parameters: type[NodeParameters]) -> dict[str, tuple[str, Specification]]:
@@ -203,39 +189,22 @@ def from_ros(parameters: type[P], values: Mapping[str, Any]) -> P:
     """
     parameters = parameters.extended(values)
     known = specifications(parameters)
-    return parameters(
-        **{
-            known[name][0]: as_declared(parameters, name, value)
-            for name, value in values.items()
-            if name in known
-        }
-    )
+    given = {name: as_declared(parameters, name, value) for name, value in values.items()}
+    return parameters(**{known[name][0]: value for name, value in given.items() if name in known})
 
 
-class Change(Protocol):
-    """A new value of a parameter, for example a `rclpy.parameter.Parameter`."""
+def changed(parameters: P, values: Mapping[str, Any]) -> P:
+    """Return the parameters with new values by their ROS names. Unknown names are ignored.
 
-    @property
-    def name(self) -> str:
-        """ROS name of the parameter."""
-
-    @property
-    def value(self) -> Any:
-        """The new value."""
-
-
-def changed(parameters: P, changes: Iterable[Change]) -> P:
-    """Return the parameters after changes. Unknown names are ignored.
-
-    Returns:
-        New parameters, or the same object if no change applies.
+    It is the same object if no value applies.
 
     Raises:
         ParameterError: The new values are invalid.
     """
-    values = {change.name: change.value for change in changes}
     before = ros_values(parameters)
-    return from_ros(type(parameters), before | values) if before.keys() & values.keys() else parameters
+    return (
+        from_ros(type(parameters), {**before, **values}) if before.keys() & values.keys() else parameters
+    )
 
 
 def ros_values(parameters: NodeParameters) -> dict[str, Any]:

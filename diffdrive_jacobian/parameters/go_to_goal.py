@@ -30,9 +30,10 @@ from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
 from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
-from diffdrive_jacobian.parameters._fields import (
-    STAMPED,
+from diffdrive_jacobian.parameters.common import (
+    TwistParameters,
     command_delay_field,
+    number_or,
     timeout_field,
     wheel_lag_field,
 )
@@ -41,7 +42,6 @@ from diffdrive_jacobian.parameters.declaration import (
     default_of,
     parameter,
 )
-from diffdrive_jacobian.parameters.limits import TwistAccelerationParameters, number_or
 from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.time_units import nanoseconds
 
@@ -79,7 +79,7 @@ def _stopped(what: str, unit: str) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class GoToGoalParameters(TwistAccelerationParameters):
+class GoToGoalParameters(TwistParameters):
     """Parameters of the node go_to_goal. Limits of the acceleration, lag and delay are known, not kept:
     they say what the robot can do.
     """
@@ -154,10 +154,8 @@ class GoToGoalParameters(TwistAccelerationParameters):
         bounds=(1e-6, 100.0),
     )
     odom_timeout: float = timeout_field(
-        0.5,
         'Time without odometry after which the robot stops, until it returns [s]; 0: never.',
     )
-    enable_stamped_cmd_vel: bool = parameter(False, STAMPED, read_only=True)
 
     @classmethod
     def with_controller(cls, controller: Controller) -> type[GoToGoalParameters]:
@@ -224,9 +222,9 @@ class GoToGoalParameters(TwistAccelerationParameters):
         )
         return cast('type[GoToGoalParameters]', made)
 
-    def limits(self) -> VelocityLimits:
+    def limits(self, default: float = MAX_SPEED) -> VelocityLimits:
         """Return the limits of the commands, at most the largest plausible twist."""
-        return self.twist_limits(MAX_SPEED)
+        return TwistParameters.limits(self, default)
 
     def actuators(self) -> Actuators:
         """Return how the robot follows commands, as far as it is known."""

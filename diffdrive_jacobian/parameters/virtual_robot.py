@@ -6,21 +6,15 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_POSITION
-from diffdrive_jacobian.parameters._fields import (
-    STAMPED,
+from diffdrive_jacobian.parameters.common import (
+    WheelParameters,
     command_delay_field,
     differ,
-    max_wheel_velocity_field,
-    multiplier_field,
     timeout_field,
     wheel_lag_field,
-    wheel_radius_field,
-    wheel_separation_field,
 )
 from diffdrive_jacobian.parameters.declaration import parameter
-from diffdrive_jacobian.parameters.limits import AccelerationParameters, number_or
 from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.simulation.robot import RobotModel
 from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
@@ -44,7 +38,7 @@ def _true_multiplier(what: str) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class VirtualRobotParameters(AccelerationParameters):
+class VirtualRobotParameters(WheelParameters):
     """Parameters of the node virtual_robot."""
 
     publish_rate: float = parameter(
@@ -52,14 +46,8 @@ class VirtualRobotParameters(AccelerationParameters):
     )
     odom_frame_id: str = parameter('odom', 'Name of the frame of the odometry.')
     base_frame_id: str = parameter('base_link', 'Name of the frame of the robot, at the axle centre.')
-    wheel_radius: float = wheel_radius_field()
-    wheel_separation: float = wheel_separation_field()
-    wheel_separation_multiplier: float = multiplier_field('wheel separation')
-    left_wheel_radius_multiplier: float = multiplier_field('radius of the left wheel')
-    right_wheel_radius_multiplier: float = multiplier_field('radius of the right wheel')
-    max_wheel_velocity: float = max_wheel_velocity_field()
     cmd_vel_timeout: float = timeout_field(
-        0.5, 'Time without a command after which the robot stops [s]; 0: never.'
+        'Time without a command after which the robot stops [s]; 0: never.'
     )
     wheel_lag: float = wheel_lag_field()
     command_delay: float = command_delay_field()
@@ -83,9 +71,6 @@ class VirtualRobotParameters(AccelerationParameters):
         choices=('twist', 'wheels'),
         read_only=True,
     )
-    enable_stamped_cmd_vel: bool = parameter(False, STAMPED, read_only=True)
-    left_wheel_name: str = parameter('left_wheel_joint', 'Name of the joint of the left wheel.')
-    right_wheel_name: str = parameter('right_wheel_joint', 'Name of the joint of the right wheel.')
     enable_odom_tf: bool = parameter(
         True,
         'Publish the transform from odom_frame_id to base_frame_id, if tf2_ros is installed. Read-only.',
@@ -106,31 +91,17 @@ class VirtualRobotParameters(AccelerationParameters):
 
     def check(self) -> None:
         """Raise ParameterError if the names of the wheels or of the frames are equal."""
-        differ('left_wheel_name', self.left_wheel_name, 'right_wheel_name', self.right_wheel_name)
+        WheelParameters.check(self)
         differ('odom_frame_id', self.odom_frame_id, 'base_frame_id', self.base_frame_id)
         if self.drift() is not None:
             truth = 'ground_truth_frame_id', self.ground_truth_frame_id
             differ(*truth, 'odom_frame_id', self.odom_frame_id)
             differ(*truth, 'base_frame_id', self.base_frame_id)
 
-    @property
-    def wheel_names(self) -> tuple[str, str]:
-        """Names of the left and the right wheel joint, in the order of messages."""
-        return self.left_wheel_name, self.right_wheel_name
-
-    def limits(self) -> VelocityLimits:
-        """Return the limits of the twist and of the wheel speed."""
-        max_wheel_speed = number_or(self.max_wheel_velocity, math.inf)
-        return replace(self.twist_limits(), max_wheel_speed=max_wheel_speed)
-
     def model(self) -> RobotModel:
         """Return the model of the robot with these parameters."""
-        return RobotModel(
-            wheel_radius=self.wheel_radius,
-            wheel_separation=self.wheel_separation * self.wheel_separation_multiplier,
-            right_wheel_radius_multiplier=self.right_wheel_radius_multiplier,
-            left_wheel_radius_multiplier=self.left_wheel_radius_multiplier,
-            limits=self.limits(),
+        return replace(
+            WheelParameters.model(self),
             command_timeout=nanoseconds(self.cmd_vel_timeout),
             wheel_travel_variance=self.wheel_travel_variance,
             drift=self.drift(),

@@ -22,8 +22,7 @@ from diffdrive_jacobian.bags.run_reader import open_bag
 from diffdrive_jacobian.recording.playback import NODE, Playback
 from diffdrive_jacobian.recording.replayer import Replayer
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
-from diffdrive_jacobian.ros.node_runner import NodeRunner
-from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.ros.runner import NodeRunner, ros_context, running
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.time_units import seconds
 

@@ -43,23 +43,16 @@ _FILES = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
 
 
 def announce_frequently() -> bool:
-    """Announce the participants of this process every 0.15 s. Receive messages through UDP.
+    """Announce the participants of this process every 0.15 s, and receive messages through UDP.
 
-    Nothing happens if the user has chosen otherwise, see the module, or by the variable SWITCH.
-
-    Returns:
-        Whether Fast DDS will do so, if it is used.
+    Return whether Fast DDS will do so: not if the user has chosen otherwise, or by the variable SWITCH.
     """
     return os.environ.get(SWITCH, '') != '0' and _use('announcements')
 
 
 @contextmanager
 def fast_heartbeats() -> Iterator[None]:
-    """Set the heartbeat period of publishers to 0.1 s.
-
-    This affects only a process that has not created a participant yet, and only Fast DDS. It does
-    nothing if the user has chosen otherwise, see the module.
-    """
+    """Set the heartbeat period of publishers to 0.1 s, in a process without participants."""
     _use('heartbeats')
     try:
         yield
@@ -68,10 +61,7 @@ def fast_heartbeats() -> Iterator[None]:
 
 
 def open_to_others() -> None:
-    """Announce the participants of this process every 0.15 s, and send heartbeats every 0.1 s.
-
-    Messages are received through UDP. The conditions are those of `announce_frequently`.
-    """
+    """Do what `announce_frequently` does, and send heartbeats every 0.1 s."""
     if announce_frequently():
         _use('heartbeats')
 
@@ -89,10 +79,7 @@ def for_other_process() -> dict[str, str]:
 
 
 def withdraw() -> None:
-    """Remove the variable if it names a file of this package.
-
-    To be called when the first participant exists. Processes that are started then do not inherit it.
-    """
+    """Remove the variable when the first participant exists: other processes must not inherit it."""
     if _own() is not None:
         del os.environ[VARIABLE]
 

@@ -10,7 +10,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias, TypeVar
 from weakref import WeakKeyDictionary
 
 from rclpy.context import Context
@@ -22,29 +22,30 @@ from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.ros.rclpy_internals import graph_changed
 from diffdrive_jacobian.text import printable
 
+Check: TypeAlias = Callable[[], str | None]
+T = TypeVar('T')
+
+MAX_AGE = 0.1
+"""`max_age` of periodic checks that need not be reproducible (s)."""
+ALTERNATION_PATIENCE = 3
+"""Number of checks with alternating commands before that is reported: a driver may take over."""
+TYPE_PATIENCE = 3
+"""Number of checks with another type before that is reported: the name of its node may come later."""
+MIN_FALLS = 2
+"""Number of falls of the sequence numbers within a second that no restarted publisher explains."""
+
 
 class LastingFault:
-    """A fault that is checked periodically.
-
-    The order in which nodes start must not matter, so a fault counts only after several checks.
-    """
+    """A fault that counts only after several checks: the order in which nodes start must not matter."""
 
     def __init__(self, patience: int) -> None:
-        """Start without the fault.
-
-        Args:
-            patience: Number of consecutive checks with the same fault after which it is reported.
-        """
+        """Start without the fault. It is reported after `patience` consecutive checks that find it."""
         self._patience = patience
         self._present: str | None = None
         self._checks = 0
 
     def check(self, present: str | None) -> str | None:
-        """Return the fault if it is to be reported now.
-
-        Args:
-            present: Description of the fault at this check. None: there is none.
-        """
+        """Return the fault that is present at this check if it is to be reported now."""
         if present != self._present:
             self._present, self._checks = present, 0
         self._checks += 1
@@ -79,29 +80,16 @@ class Interleaving:
         return falls
 
 
-MAX_AGE = 0.1
-"""`max_age` of periodic checks that need not be reproducible (s)."""
-
-
-class Snapshot:
-    """What was queried since the last change of the graph. Another change leads to another object."""
+class _Snapshot:
+    """Results of queries of the graph since its last change, shared by the nodes of a context."""
 
     def __init__(self) -> None:
-        """Start without results of queries."""
-        self.publishers: dict[str, int] = {}
-        """Numbers of publishers by topic, as far as they were queried."""
-        self.subscriptions: dict[str, int] = {}
-        """Numbers of subscriptions by topic, as far as they were queried."""
-        self.types: dict[str, list[str]] | None = None
-        """Types of all topics by name; None: not queried."""
-
-
-class _Latest:
-    """The latest snapshot of a context."""
-
-    def __init__(self) -> None:
-        self.snapshot = Snapshot()
+        self.results: dict[str, Any] = {}
         self.refreshed = -math.inf
+
+
+_lock = threading.Lock()
+_snapshots: WeakKeyDictionary[Context, _Snapshot] = WeakKeyDictionary()
 
 
 class SharedGraph:
@@ -112,66 +100,44 @@ class SharedGraph:
     """
 
     def __init__(self, node: Node) -> None:
-        """Share the snapshot of a node's context.
-
-        Args:
-            node: The node that queries.
-        """
+        """Share the snapshot of the context of a node."""
         self._node = node
         # All nodes must share one object: a change is signaled once.
         with _lock:
-            self._latest = _latest_of.setdefault(node.context, _Latest())
+            self._snapshot = _snapshots.setdefault(node.context, _Snapshot())
 
-    def refresh(self, max_age: float = 0.0) -> Snapshot:
-        """Discard the snapshot if the graph has changed. Return the valid one.
+    def refresh(self, max_age: float = 0.0) -> None:
+        """Discard the results if the graph has changed.
 
         Args:
-            max_age: For how long a snapshot is valid without looking for changes (wall time, s). To look
-                for them takes 0.03 to 0.15 ms.
+            max_age: For how long they are valid without looking for changes (wall time, s). To look for
+                them takes 0.03 to 0.15 ms.
         """
-        latest, now = self._latest, time.monotonic()
-        if now - latest.refreshed >= max_age:
-            latest.refreshed = now
+        snapshot, now = self._snapshot, time.monotonic()
+        if now - snapshot.refreshed >= max_age:
+            snapshot.refreshed = now
             if graph_changed(self._node):
-                # Replaced, not cleared: another thread may still add a result to the previous one.
-                latest.snapshot = Snapshot()
-        return latest.snapshot
+                # Replaced, not cleared: another thread may still add a result to the previous ones.
+                snapshot.results = {}
 
     def count_publishers(self, topic: str) -> int:
         """Return the number of publishers of a topic."""
-        return _known(self._latest.snapshot.publishers, topic, self._node.count_publishers)
+        return self._query(f'to {topic}', lambda: int(self._node.count_publishers(topic)))
 
     def count_subscriptions(self, topic: str) -> int:
         """Return the number of subscriptions to a topic."""
-        return _known(self._latest.snapshot.subscriptions, topic, self._node.count_subscribers)
+        return self._query(f'from {topic}', lambda: int(self._node.count_subscribers(topic)))
 
     def types(self) -> dict[str, list[str]]:
         """Return the types of all topics, by name."""
-        snapshot = self._latest.snapshot
-        if snapshot.types is None:
-            snapshot.types = dict(self._node.get_topic_names_and_types())
-        return snapshot.types
+        return self._query('types', lambda: dict(self._node.get_topic_names_and_types()))
 
-
-def _known(counts: dict[str, int], topic: str, query: Callable[[str], int]) -> int:
-    count = counts.get(topic)
-    if count is None:
-        count = counts[topic] = query(topic)
-    return count
-
-
-_lock = threading.Lock()
-_latest_of: WeakKeyDictionary[Context, _Latest] = WeakKeyDictionary()
-
-
-Check: TypeAlias = Callable[[], str | None]
-
-ALTERNATION_PATIENCE = 3
-"""Number of checks with alternating commands before that is reported: a driver may take over."""
-TYPE_PATIENCE = 3
-"""Number of checks with another type before that is reported: the name of its node may come later."""
-MIN_FALLS = 2
-"""Number of falls of the sequence numbers within a second that no restarted publisher explains."""
+    def _query(self, what: str, query: Callable[[], T]) -> T:
+        results = self._snapshot.results
+        if what not in results:
+            results[what] = query()
+        found: T = results[what]
+        return found
 
 
 def topic_check(
@@ -197,13 +163,7 @@ def topic_check(
 
 
 def alternating_commands(node: Node, name: str, commands: Interleaving) -> Check:
-    """Return a check whether the commands of several publishers alternate.
-
-    Args:
-        node: The node that receives them.
-        name: Name of the topic as the node gives it, before it is remapped.
-        commands: Counts the commands of the node that are not zero.
-    """
+    """Return a check whether the commands that are not zero on a topic alternate."""
     several = topic_check(node, ALTERNATING, name)
     return lambda: several() if commands.falls() >= MIN_FALLS else None
 

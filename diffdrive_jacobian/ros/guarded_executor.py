@@ -19,7 +19,6 @@ are executed until they are done.
 from __future__ import annotations
 
 import time
-from typing import Protocol
 
 from rclpy.context import Context
 from rclpy.executors import Executor, SingleThreadedExecutor
@@ -58,22 +57,6 @@ LOG_BURST, LOG_PERIOD = 3, 60.0
 """Episodes that are logged: the first ones, then one per period (s)."""
 
 
-class NodeExecutor(Protocol):
-    """What a runner needs of an executor."""
-
-    def add_node(self, node: Node) -> object:
-        """Execute the callbacks of a node from now on."""
-
-    def remove_node(self, node: Node) -> None:
-        """Execute no more callbacks of a node."""
-
-    def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Execute one callback; wait for it for at most a time (s)."""
-
-    def shutdown(self) -> object:
-        """Release the nodes."""
-
-
 class GuardedExecutor:
     """Executes callbacks on the EventsExecutor, and under a flood on the SingleThreadedExecutor."""
 
@@ -88,7 +71,9 @@ class GuardedExecutor:
         self._events = events
         self._single: Executor | None = None
         self._nodes: list[Node] = []
-        self._fair = self._fair_only = False
+        self.fair = False
+        """Whether the nodes are on the SingleThreadedExecutor."""
+        self._fair_only = False
         # Whether a callback was executed in the present round of the SingleThreadedExecutor.
         self._executed = True
         self._observed = self._idle = 0.0
@@ -105,11 +90,6 @@ class GuardedExecutor:
         self._episode = self._logged = False
         self._limit = TokenBucket(LOG_BURST, LOG_PERIOD)
 
-    @property
-    def fair(self) -> bool:
-        """Whether the nodes are on the SingleThreadedExecutor."""
-        return self._fair
-
     def add_node(self, node: Node) -> None:
         """Execute the callbacks of a node from now on.
 
@@ -118,17 +98,17 @@ class GuardedExecutor:
         """
         self._nodes.append(node)
         self._fair_only |= requires_wait_set(node)
-        if self._fair:
+        if self.fair:
             self._single_threaded().add_node(node)
         elif self._fair_only:
             self.use_single_threaded()
-        if not self._fair:
+        if not self.fair:
             self._events.add_node(node)
 
     def remove_node(self, node: Node) -> None:
         """Execute no more callbacks of a node."""
         self._nodes.remove(node)
-        executor = self._single_threaded() if self._fair else self._events
+        executor = self._single_threaded() if self.fair else self._events
         executor.remove_node(node)
 
     def shutdown(self) -> None:
@@ -143,7 +123,7 @@ class GuardedExecutor:
         Raises:
             ExternalShutdownException: The context was shut down.
         """
-        if self._fair:
+        if self.fair:
             self._spin_fair(timeout_sec)
             return
         self._events.spin_once(timeout_sec=timeout_sec)
@@ -245,7 +225,7 @@ class GuardedExecutor:
         self._events.shutdown()
         for node in self._nodes:
             self._single_threaded().add_node(node)
-        self._fair, self._executed = True, True
+        self.fair, self._executed = True, True
         self._observed, self._idle = time.monotonic(), 0.0
         self._sample = self._most = None
         self._handled = 0
@@ -262,7 +242,7 @@ class GuardedExecutor:
         for node in self._nodes:
             # This removes it from the other executor.
             self._events.add_node(node)
-        self._fair = False
+        self.fair = False
         self._moved = self._sampled = time.monotonic()
         self._handled = SAMPLE_EVENTS
 

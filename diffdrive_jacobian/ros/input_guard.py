@@ -36,111 +36,83 @@ def guard_inputs(node: Node) -> None:
 
     /clock is also guarded when `use_sim_time` becomes true later.
     """
-    wrap_clock_callback(node, partial(_guarded_clock, node))
-    wrap_service_callback(node, SetParameters, partial(_guarded_set_parameters, node))
-    wrap_service_callback(
-        node, SetParametersAtomically, partial(_guarded_set_parameters_atomically, node)
-    )
-    wrap_service_callback(node, GetTypeDescription, partial(_guarded_get_type_description, node))
+    # Each guard takes the node and the function that it guards before the arguments of that function.
+    wrap_clock_callback(node, partial(partial, _on_clock, node))
+    for service, guard in (
+        (SetParameters, _on_set_parameters),
+        (SetParametersAtomically, _on_set_parameters_atomically),
+        (GetTypeDescription, _on_get_type_description),
+    ):
+        wrap_service_callback(node, service, partial(partial, guard, node))
 
 
-def _guarded_clock(node: Node, accept: Callable[[Clock], None]) -> Callable[[Clock], None]:
-    log = node.get_logger()
-
-    def on_clock(message: Clock) -> None:
-        try:
-            from_time(message.clock.sec, message.clock.nanosec)
-        except MessageError as error:
-            log.warning(f'/clock dropped: {error}', throttle_duration_sec=THROTTLE)
-            return
-        accept(message)
-
-    return on_clock
+def _on_clock(node: Node, accept: Callable[[Clock], None], message: Clock) -> None:
+    try:
+        from_time(message.clock.sec, message.clock.nanosec)
+    except MessageError as error:
+        node.get_logger().warning(f'/clock dropped: {error}', throttle_duration_sec=THROTTLE)
+        return
+    accept(message)
 
 
-def _guarded_set_parameters(
-    node: Node, accept: Callable[[Any, Any], Any]
-) -> Callable[[SetParameters.Request, SetParameters.Response], SetParameters.Response]:
-    log = node.get_logger()
-
-    def on_request(
-        request: SetParameters.Request, response: SetParameters.Response
-    ) -> SetParameters.Response:
-        results = [_refusal(parameter) for parameter in request.parameters]
-        refusal = next((result for result in results if result is not None), None)
-        if refusal is None:
-            return accept(request, response)
-        log.warning(f'parameter request refused: {refusal.reason}', throttle_duration_sec=THROTTLE)
-        request.parameters = [
-            parameter
-            for parameter, result in zip(request.parameters, results, strict=True)
-            if result is None
-        ]
-        accepted = iter(accept(request, response).results)
-        response.results = [next(accepted) if result is None else result for result in results]
-        return response
-
-    return on_request
-
-
-def _guarded_set_parameters_atomically(
-    node: Node, accept: Callable[[Any, Any], Any]
-) -> Callable[
-    [SetParametersAtomically.Request, SetParametersAtomically.Response],
-    SetParametersAtomically.Response,
-]:
-    log = node.get_logger()
-
-    def on_request(
-        request: SetParametersAtomically.Request, response: SetParametersAtomically.Response
-    ) -> SetParametersAtomically.Response:
-        for parameter in request.parameters:
-            refusal = _refusal(parameter)
-            if refusal is not None:
-                log.warning(
-                    f'parameter request refused: {refusal.reason}', throttle_duration_sec=THROTTLE
-                )
-                response.result = refusal
-                return response
+def _on_set_parameters(
+    node: Node, accept: Callable[[Any, Any], Any], request: Any, response: Any
+) -> Any:
+    refusals = [_refusal(parameter) for parameter in request.parameters]
+    if not any(refusals):
         return accept(request, response)
-
-    return on_request
-
-
-def _guarded_get_type_description(
-    node: Node, accept: Callable[[Any, Any], Any]
-) -> Callable[[GetTypeDescription.Request, GetTypeDescription.Response], GetTypeDescription.Response]:
-    log = node.get_logger()
-
-    def on_request(
-        request: GetTypeDescription.Request, response: GetTypeDescription.Response
-    ) -> GetTypeDescription.Response:
-        if _TYPE_HASH.fullmatch(request.type_hash):
-            return accept(request, response)
-        # The hash may have any length, so it is not repeated.
-        response.failure_reason = (
-            'type_hash must be RIHS01_ and 64 hexadecimal digits, got '
-            f'{len(request.type_hash)} other characters'
-        )
-        log.warning(
-            f'type description request refused: {response.failure_reason}',
-            throttle_duration_sec=THROTTLE,
-        )
-        response.successful = False
-        return response
-
-    return on_request
+    _warn(node, refusals)
+    pairs = zip(request.parameters, refusals, strict=True)
+    request.parameters = [parameter for parameter, refusal in pairs if not refusal]
+    accepted = iter(accept(request, response).results)
+    response.results = [_refused(refusal) if refusal else next(accepted) for refusal in refusals]
+    return response
 
 
-def _refusal(parameter: ParameterMessage) -> SetParametersResult | None:
-    """Return the result for a parameter that rclpy cannot handle; None: it can."""
+def _on_set_parameters_atomically(
+    node: Node, accept: Callable[[Any, Any], Any], request: Any, response: Any
+) -> Any:
+    refusals = [_refusal(parameter) for parameter in request.parameters]
+    if not any(refusals):
+        return accept(request, response)
+    response.result = _refused(_warn(node, refusals))
+    return response
+
+
+def _on_get_type_description(
+    node: Node, accept: Callable[[Any, Any], Any], request: Any, response: Any
+) -> Any:
+    if _TYPE_HASH.fullmatch(request.type_hash):
+        return accept(request, response)
+    response.successful = False
+    # The hash may have any length, so it is not repeated.
+    response.failure_reason = (
+        'type_hash must be RIHS01_ and 64 hexadecimal digits, got '
+        f'{len(request.type_hash)} other characters'
+    )
+    node.get_logger().warning(
+        f'type description request refused: {response.failure_reason}', throttle_duration_sec=THROTTLE
+    )
+    return response
+
+
+def _refusal(parameter: ParameterMessage) -> str:
+    """Return why rclpy cannot handle a parameter; '': it can."""
     if parameter.value.type not in _TYPES:
-        return SetParametersResult(
-            successful=False,
-            reason=f"parameter '{printable(parameter.name)}' must have a type in 0 to {max(_TYPES)}, "
-            f'got type {parameter.value.type}',
+        return (
+            f"parameter '{printable(parameter.name)}' must have a type in 0 to {max(_TYPES)}, "
+            f'got type {parameter.value.type}'
         )
-    if not parameter.name:
-        # rclpy would set it, although it is not declared.
-        return SetParametersResult(successful=False, reason='a parameter must have a name, got none')
-    return None
+    # rclpy would set it, although it is not declared.
+    return '' if parameter.name else 'a parameter must have a name, got none'
+
+
+def _warn(node: Node, refusals: list[str]) -> str:
+    """Log the first refusal, and return it."""
+    first = next(filter(None, refusals))
+    node.get_logger().warning(f'parameter request refused: {first}', throttle_duration_sec=THROTTLE)
+    return first
+
+
+def _refused(why: str) -> SetParametersResult:
+    return SetParametersResult(successful=False, reason=why)

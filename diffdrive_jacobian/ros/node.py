@@ -8,7 +8,9 @@ and report each once.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import chain
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
@@ -25,22 +27,30 @@ from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.messages.cdr import DecodingError, integer_warning
 from diffdrive_jacobian.messages.codecs import Codec
-from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, changed
-from diffdrive_jacobian.ros import parameters as ros_parameters
+from diffdrive_jacobian.messages.names import type_name
+from diffdrive_jacobian.parameters.declaration import (
+    NodeParameters,
+    ParameterError,
+    as_declared,
+    changed,
+)
 from diffdrive_jacobian.ros.graph_faults import (
+    ALTERNATION_PATIENCE,
     MAX_AGE,
     TYPE_PATIENCE,
     Interleaving,
     LastingFault,
     SharedGraph,
+    alternating_commands,
     wrong_type,
 )
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
+from diffdrive_jacobian.ros.parameters import declare, declare_new
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
-from diffdrive_jacobian.ros.rclpy_internals import log_info, time_reader
+from diffdrive_jacobian.ros.rclpy_internals import log_info, parameter_overrides, reason, time_reader
 from diffdrive_jacobian.ros.serialization import decoding
-from diffdrive_jacobian.ros.topic_errors import explaining_failure
+from diffdrive_jacobian.text import printable
 
 P = TypeVar('P', bound=NodeParameters)
 
@@ -78,7 +88,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         """
         super().__init__(name, **kwargs)
         try:
-            self.parameters = ros_parameters.declare(self, parameters)
+            self.parameters = declare(self, parameters)
         except ParameterError:
             self.destroy_node()
             raise
@@ -86,7 +96,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         self.now: Callable[[], int] = time_reader(self.get_clock())
         """Return the time of the node's clock (ns); 0: simulated time has not started."""
         self._event_limits: dict[str, TokenBucket] = {}
-        self.add_pre_set_parameters_callback(self._convert_parameters)
+        self.add_pre_set_parameters_callback(self._accept_integers)
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._graph = SharedGraph(self)
@@ -95,13 +105,18 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(WATCH_PERIOD, lambda: self._check_graph(MAX_AGE), clock=steady)
 
-    def advertise(self, message: type, topic: str, *, latched: bool = False) -> Publisher:
-        """Create a publisher with reliable QoS, keep last 10.
+    # --- For subclasses
 
-        Args:
-            message: Type of the messages.
-            topic: Name of the topic.
-            latched: Whether later subscriptions receive the last messages (transient local).
+    def parameters_changed(self, previous: P) -> None:
+        """React to new values in `parameters`, which may equal the previous ones."""
+
+    def stop(self, why: str) -> None:
+        """Stop what this node commands, and log why: it is destroyed, or time does not advance."""
+
+    # --- Topics and services
+
+    def advertise(self, message: type, topic: str, *, latched: bool = False) -> Publisher:
+        """Create a publisher with reliable QoS, keep last 10, with `latched` transient local.
 
         Raises:
             ParameterError: The topic has another type in this process, or `qos_overrides` are invalid.
@@ -137,8 +152,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             callback: Called with the fields of each message that the codec reads, one argument each. Its
                 `value` checks them.
             codec: What is read of the messages. None: the callback receives the serialized bytes.
-            numbers: Receives the sequence number of each message before the callback is called. It
-                needs a codec.
+            numbers: Receives the sequence number of each message before the callback is called, which
+                counts those that must not alternate with those of others. It needs a codec.
 
         Raises:
             ParameterError: As for `advertise`.
@@ -148,28 +163,89 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             self.get_logger().warning(f'{topic} dropped: {error}', throttle_duration_sec=THROTTLE)
 
         self.watch(wrong_type(self, topic, message, subscribed=True), TYPE_PATIENCE, error=True)
-        profile = QoSProfile(depth=10)
         if codec is not None:
             callback = decoding(message, codec.fields, callback, dropped, numbers)
+        if numbers is not None:
+            self.watch(alternating_commands(self, topic, numbers), ALTERNATION_PATIENCE)
         with explaining_failure(self, message, topic):
             return self.create_subscription(
                 message,
                 topic,
                 callback,
-                profile,
+                QoSProfile(depth=10),
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
                 raw=True,
             )
 
     def provide(self, service: Any, name: str, callback: Callable[[Any, Any], Any]) -> Service:
-        """Create a service.
-
-        Raises:
-            RuntimeError: Its name is invalid.
-        """
+        """Create a service. Raise RuntimeError if its name is invalid."""
         # create_service raises UnboundLocalError for an invalid name.
         self.resolve_service_name(name)
         return self.create_service(service, name, callback)
+
+    @staticmethod
+    def flush(publisher: Publisher) -> None:
+        """Wait until the last messages have arrived: destroying their publisher would drop them."""
+        publisher.wait_for_all_acked(FLUSH_PATIENCE)
+
+    # --- Log
+
+    def announce(self, *, subscribed: Iterable[str], publishing: Iterable[str]) -> None:
+        """Log that the node is ready, with its main topics."""
+        received, sent = (
+            ', '.join(self.resolve_topic_name(topic) for topic in topics)
+            for topics in (subscribed, publishing)
+        )
+        log_info(self, f'subscribed to {received}, publishing {sent}')
+
+    def warn_of_integers(self, what: str, *values: float) -> None:
+        """Warn, throttled, if a value of what is named is an integer assigned to a field of floats."""
+        if warning := integer_warning(what, *values):
+            self.get_logger().warning(warning, throttle_duration_sec=THROTTLE)
+
+    def log_event_info(self, event: str, text: str) -> None:
+        """Log a line at level info, of each kind of event EVENT_BURST, then one per EVENT_PERIOD."""
+        if self._may_log(event):
+            self.get_logger().info(text)
+
+    def log_event_warning(self, event: str, text: str) -> None:
+        """Log a line at level warning, at the rate of `log_event_info`."""
+        if self._may_log(event):
+            self.get_logger().warning(text)
+
+    def _may_log(self, event: str) -> bool:
+        limit = self._event_limits.setdefault(event, TokenBucket(EVENT_BURST, EVENT_PERIOD))
+        return limit.permits(time.monotonic())
+
+    # --- Parameters
+
+    def _accept_integers(self, changes: list[Parameter]) -> list[Parameter]:
+        """Convert integers to doubles where doubles are declared."""
+        kind = type(self.parameters)
+        return [
+            Parameter(change.name, value=as_declared(kind, change.name, change.value))
+            if change.type_ == Parameter.Type.INTEGER
+            else change
+            for change in changes
+        ]
+
+    def _validate_parameters(self, changes: list[Parameter]) -> SetParametersResult:
+        try:
+            changed(self.parameters, {one.name: one.value for one in changes})
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply_parameters(self, changes: list[Parameter]) -> None:
+        previous = self.parameters
+        self.parameters = changed(previous, {one.name: one.value for one in changes})
+        if self.parameters is previous:
+            return
+        if type(self.parameters) is not type(previous):
+            self.parameters = declare_new(self, previous, self.parameters)
+        self.parameters_changed(previous)
+
+    # --- Checks
 
     def watch(
         self, check: Callable[[], str | None], patience: int = FAULT_PATIENCE, *, error: bool = False
@@ -182,74 +258,6 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             error: Whether it is an error. Otherwise it is a warning.
         """
         self._faults.append((LastingFault(patience), check, error))
-
-    def warn_of_integers(self, what: str, *values: float) -> None:
-        """Warn, throttled, if a value is an integer that was assigned to a field of floats.
-
-        Args:
-            what: What has the values.
-            values: The values of the fields.
-        """
-        if warning := integer_warning(what, *values):
-            self.get_logger().warning(warning, throttle_duration_sec=THROTTLE)
-
-    def log_event_info(self, event: str, text: str) -> None:
-        """Log an event at level info, at a limited rate.
-
-        Args:
-            event: Kind of the event. Of each kind EVENT_BURST lines are written without a delay, then
-                one per EVENT_PERIOD.
-            text: The line.
-        """
-        if self._may_log(event):
-            self.get_logger().info(text)
-
-    def log_event_warning(self, event: str, text: str) -> None:
-        """Log an event at level warning, at the rate of `log_event_info`."""
-        if self._may_log(event):
-            self.get_logger().warning(text)
-
-    def _may_log(self, event: str) -> bool:
-        limit = self._event_limits.setdefault(event, TokenBucket(EVENT_BURST, EVENT_PERIOD))
-        return limit.permits(time.monotonic())
-
-    def parameters_changed(self, previous: P) -> None:
-        """React to new values in `parameters`, which may equal the previous ones."""
-
-    def stop(self, why: str) -> None:
-        """Stop what this node commands. Called before it is destroyed, and while time does not advance.
-
-        Args:
-            why: The reason, for the log.
-        """
-
-    def announce(self, *, subscribed: Iterable[str], publishing: Iterable[str]) -> None:
-        """Log that the node is ready, with its main topics."""
-        received, sent = (
-            ', '.join(self.resolve_topic_name(topic) for topic in topics)
-            for topics in (subscribed, publishing)
-        )
-        log_info(self, f'subscribed to {received}, publishing {sent}')
-
-    @staticmethod
-    def flush(publisher: Publisher) -> None:
-        """Wait until the last messages have arrived: destroying their publisher would drop them."""
-        publisher.wait_for_all_acked(FLUSH_PATIENCE)
-
-    def _convert_parameters(self, changes: list[Parameter]) -> list[Parameter]:
-        return ros_parameters.accept_integers(type(self.parameters), changes)
-
-    def _validate_parameters(self, changes: list[Parameter]) -> SetParametersResult:
-        return ros_parameters.validate(self.parameters, changes)
-
-    def _apply_parameters(self, changes: list[Parameter]) -> None:
-        previous = self.parameters
-        self.parameters = changed(previous, changes)
-        if self.parameters is previous:
-            return
-        if type(self.parameters) is not type(previous):
-            self.parameters = ros_parameters.declare_new(self, previous, self.parameters)
-        self.parameters_changed(previous)
 
     def _check_graph(self, max_age: float = 0.0) -> None:
         self._check_clock()
@@ -274,3 +282,59 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 f'use_sim_time is true, but nothing came on /clock for {CLOCK_PATIENCE} s: this node '
                 'does nothing until it does; publish /clock or set use_sim_time to false'
             )
+
+
+@contextmanager
+def explaining_failure(node: Node, message: type, topic: str) -> Iterator[None]:
+    """Explain why rclpy cannot create a publisher or a subscription of a node.
+
+    Within a process Fast DDS refuses a topic of two types, which rclpy reports as "invalid allocator".
+    `qos_overrides` may be a combination that does not exist (RuntimeError), or a number that does not
+    fit the profile of the middleware (TypeError).
+
+    Raises:
+        ParameterError: The topic has another type in this process, or `qos_overrides` are invalid.
+    """
+    try:
+        yield
+    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
+        explanation = _explanation(node, message, node.resolve_topic_name(topic), error)
+        if explanation is None:
+            raise
+        raise ParameterError(explanation) from error
+
+
+def _explanation(node: Node, message: type, name: str, error: Exception) -> str | None:
+    """Return why a topic cannot be created; None: the error is not about its type or its QoS."""
+    wanted = type_name(message)
+    others: list[str] = []
+    if isinstance(error, RuntimeError):
+        types = dict(node.get_topic_names_and_types()).get(name, [])
+        others = [printable(other) for other in types if other != wanted]
+    if others:
+        used = {
+            type_name(endpoint.msg_type)
+            for endpoint in chain(node.publishers, node.subscriptions)
+            if endpoint.topic_name == name
+        }
+        if own := sorted(used - {wanted}):
+            return (
+                f'two topics of this node have the name {name}, one with type {wanted}, the other with '
+                f'{", ".join(own)}: remap them to different names'
+            )
+        stamped = 'Twist' in wanted and any('Twist' in other for other in others)
+        hint = ' (is enable_stamped_cmd_vel the same for both?)' if stamped else ''
+        return (
+            f'{name} must have one type within a process: this node uses {wanted}, another one '
+            f'{", ".join(others)}{hint}'
+        )
+    prefix = f'qos_overrides.{name}.'
+    given = [
+        f'{key.removeprefix(prefix)}: {override.value}'
+        for key, override in sorted(parameter_overrides(node).items())
+        if key.startswith(prefix)
+    ]
+    if not given:
+        return None
+    why = reason(error) if isinstance(error, RuntimeError) else 'a number is out of range'
+    return f'the qos_overrides of {name} are invalid: {why} (got {printable(", ".join(given))})'

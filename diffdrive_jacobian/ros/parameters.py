@@ -1,4 +1,4 @@
-"""Declaration of the parameters of a node in rclpy, and the callbacks for their changes."""
+"""Declaration of the parameters of a node in rclpy, and a report of those that no node declares."""
 
 from __future__ import annotations
 
@@ -12,24 +12,20 @@ from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
-    SetParametersResult,
 )
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import (
     NodeParameters,
     ParameterError,
     Specification,
-    as_declared,
-    changed,
-    default_of,
     from_ros,
     ros_values,
     specifications,
 )
+from diffdrive_jacobian.parameters.file import is_shared, sections
 from diffdrive_jacobian.ros.rclpy_internals import (
     PARAMETERS_OF_RCLPY,
     declared_parameters,
@@ -42,8 +38,8 @@ SHORT = 3
 P = TypeVar('P', bound=NodeParameters)
 
 
-def descriptor(specification: Specification, default: Any) -> ParameterDescriptor:
-    """Return the descriptor of a parameter, which `ros2 param describe` shows."""
+def descriptor(specification: Specification, value: Any) -> ParameterDescriptor:
+    """Return the descriptor of a parameter with such values, which `ros2 param describe` shows."""
     constraint = specification.constraint or specification.allowed
     result = ParameterDescriptor(
         description=specification.description,
@@ -53,7 +49,7 @@ def descriptor(specification: Specification, default: Any) -> ParameterDescripto
     if specification.range is None:
         return result
     low, high = specification.range
-    if isinstance(default, float):
+    if isinstance(value, float):
         result.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     else:
         result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
@@ -61,10 +57,7 @@ def descriptor(specification: Specification, default: Any) -> ParameterDescripto
 
 
 def declare(node: Node, parameters: type[P]) -> P:
-    """Declare all parameters of a node with the values that the user gave.
-
-    Returns:
-        The parameters.
+    """Declare all parameters of a node with the values that the user gave, and return them.
 
     Raises:
         ParameterError: The values are invalid. No parameter is declared.
@@ -76,10 +69,9 @@ def declare(node: Node, parameters: type[P]) -> P:
 
 
 def declare_new(node: Node, before: P, after: P) -> P:
-    """Declare the parameters that a change of others has added, with the values that the user gave.
+    """Declare the parameters that a change of others has added, and return all of them.
 
-    Returns:
-        The parameters after the change. A value that is invalid is ignored, with a warning.
+    The new ones have the values that the user gave. An invalid value is ignored, with a warning.
     """
     new = specifications(type(after)).keys() - specifications(type(before)).keys()
     overrides = parameter_overrides(node)
@@ -93,45 +85,9 @@ def declare_new(node: Node, before: P, after: P) -> P:
 
 
 def _declare(node: Node, parameters: NodeParameters, names: Iterable[str]) -> None:
-    kind = type(parameters)
-    known = specifications(kind)
-    node.declare_parameters(
-        '',
-        [
-            (
-                name,
-                getattr(parameters, known[name][0]),
-                descriptor(known[name][1], default_of(kind, known[name][0])),
-            )
-            for name in names
-        ],
-        ignore_override=True,
-    )
-
-
-def accept_integers(parameters: type[NodeParameters], changes: list[Parameter]) -> list[Parameter]:
-    """Return changes with integers converted to doubles where doubles are declared.
-
-    For `Node.add_pre_set_parameters_callback`.
-    """
-    return [
-        Parameter(change.name, value=as_declared(parameters, change.name, change.value))
-        if change.type_ == Parameter.Type.INTEGER
-        else change
-        for change in changes
-    ]
-
-
-def validate(parameters: NodeParameters, changes: Iterable[Parameter]) -> SetParametersResult:
-    """Return whether parameters are valid after changes.
-
-    For `Node.add_on_set_parameters_callback`.
-    """
-    try:
-        changed(parameters, changes)
-    except ParameterError as error:
-        return SetParametersResult(successful=False, reason=str(error))
-    return SetParametersResult(successful=True)
+    known, values = specifications(type(parameters)), ros_values(parameters)
+    declared = [(name, values[name], descriptor(known[name][1], values[name])) for name in names]
+    node.declare_parameters('', declared, ignore_override=True)
 
 
 def _program(node: Node) -> str:
@@ -147,20 +103,12 @@ _files: WeakKeyDictionary[Context, list[str]] = WeakKeyDictionary()
 
 
 def use_files(context: Context, arguments: Sequence[str]) -> None:
-    """Note which parameter files a context has, for `report_unknown`.
-
-    Args:
-        context: The context.
-        arguments: Its ROS arguments, in which files follow `--params-file`.
-    """
+    """Note which parameter files the ROS arguments of a context name, for `report_unknown`."""
     _files[context] = [path for flag, path in pairwise(arguments) if flag == '--params-file']
 
 
 def _shared(context: Context) -> set[str]:
     """Return the names of the parameters that files give to nodes of any name, as under `/**`."""
-    # Slow to import.
-    from diffdrive_jacobian.parameters.file import is_shared, sections
-
     found: set[str] = set()
     for path in _files.get(context, ()):
         # What is wrong for rcl is an error before.

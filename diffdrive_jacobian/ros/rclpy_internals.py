@@ -142,10 +142,6 @@ def wrap_clock_callback(
     """Replace the function that receives /clock, now and after `use_sim_time` changes.
 
     Relies on `Node._time_source`, `TimeSource.clock_callback` and `TimeSource._clock_sub`.
-
-    Args:
-        node: The node.
-        wrap: Receives the present function, returns its replacement.
     """
     source = node._time_source
     source.clock_callback = wrap(source.clock_callback)
@@ -159,11 +155,6 @@ def wrap_service_callback(
     """Replace the callbacks of the services of a type, including those that rclpy provides.
 
     Relies on `Service.srv_type` and on `Service.callback`, which every executor reads for each request.
-
-    Args:
-        node: The node.
-        service_type: Type of the services.
-        wrap: Receives the present callback, returns its replacement.
     """
     for service in node.services:
         if service.srv_type is service_type:
@@ -171,13 +162,9 @@ def wrap_service_callback(
 
 
 def on_response(client: Client, listen: Callable[[int], None]) -> None:
-    """Call a function for each response to a client, also when several servers answer one request.
+    """Call a function with the number of the request for each response, also of several servers.
 
     Relies on executors calling `Client.get_pending_request` of the instance for each response.
-
-    Args:
-        client: The client.
-        listen: Receives the sequence number of the request.
     """
     get_pending_request = client.get_pending_request
 
@@ -209,10 +196,6 @@ def wrap_sleep(clock: Clock, wrap: Callable[[Callable[..., Any]], Callable[..., 
     """Replace `sleep_until` of a clock, once.
 
     Relies on `Clock.sleep_for` calling `sleep_until` of the instance.
-
-    Args:
-        clock: The clock.
-        wrap: Receives the present method, returns its replacement.
     """
     if 'sleep_until' not in vars(clock):
         clock.sleep_until = wrap(clock.sleep_until)
@@ -292,9 +275,6 @@ def message_taker(
 
     Relies on `Subscription.handle.take_message`, which returns the message and its info. Until its use
     ends, the subscription is not destroyed.
-
-    Args:
-        subscription: The subscription.
     """
     handle = subscription.handle
     handle.__enter__()
@@ -313,10 +293,6 @@ def refuse_init(context: Context, refuse: Callable[..., None]) -> None:
     """Let `rclpy.init` of a context that is initialized call a function, which raises an error.
 
     Relies on `rclpy.init` calling `Context.init`.
-
-    Args:
-        context: The context.
-        refuse: The function. It receives the arguments of `Context.init`.
     """
     context.init = refuse
 
@@ -324,62 +300,47 @@ def refuse_init(context: Context, refuse: Callable[..., None]) -> None:
 def on_new_node(created: Callable[[Node], None]) -> Callable[[], None]:
     """Call a function with each new node, when the constructor of `Node` has returned.
 
-    Relies on that of subclasses calling it. A context does not know its nodes.
-
-    Returns:
-        A function that ends it.
+    Return what ends that. Relies on that of subclasses calling it. A context does not know its nodes.
     """
-    init = Node.__init__
 
-    @wraps(init)
-    def initialize(self: Node, *args: Any, **kwargs: Any) -> None:
-        init(self, *args, **kwargs)
-        created(self)
+    def wrap(init: Callable[..., None]) -> Callable[..., None]:
+        @wraps(init)
+        def initialize(self: Node, *args: Any, **kwargs: Any) -> None:
+            init(self, *args, **kwargs)
+            created(self)
 
-    Node.__init__ = initialize
+        return initialize
 
-    def restore() -> None:
-        Node.__init__ = init
-
-    return restore
+    return _replaced(wrap, (Node, '__init__'))
 
 
 def wrap_calls(wrap: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Callable[[], None]:
     """Replace the methods of all clients and services that send a request or a response.
 
-    Relies on `Client.call_async` and `Service.send_response` being looked up in the class for each one.
-
-    Args:
-        wrap: Receives a present method, returns its replacement.
-
-    Returns:
-        A function that restores the present ones.
+    Return what restores them. Relies on their being looked up in the class for each one.
     """
-    call_async, send_response = Client.call_async, Service.send_response
-    Client.call_async, Service.send_response = wrap(call_async), wrap(send_response)
-
-    def restore() -> None:
-        Client.call_async, Service.send_response = call_async, send_response
-
-    return restore
+    return _replaced(wrap, (Client, 'call_async'), (Service, 'send_response'))
 
 
 def wrap_publish(wrap: Callable[[Callable[..., None]], Callable[..., None]]) -> Callable[[], None]:
-    """Replace `publish` of all publishers.
+    """Replace `publish` of all publishers. Return what restores it.
 
     Relies on `Publisher.publish` being looked up in the class for each message.
-
-    Args:
-        wrap: Receives the present function (publisher, message), returns its replacement.
-
-    Returns:
-        A function that restores the present one.
     """
-    publish = Publisher.publish
-    Publisher.publish = wrap(publish)
+    return _replaced(wrap, (Publisher, 'publish'))
+
+
+def _replaced(
+    wrap: Callable[[Callable[..., Any]], Callable[..., Any]], *methods: tuple[type, str]
+) -> Callable[[], None]:
+    """Replace methods of classes by what `wrap` makes of them. Return a function that restores them."""
+    present = [(owner, name, getattr(owner, name)) for owner, name in methods]
+    for owner, name, method in present:
+        setattr(owner, name, wrap(method))
 
     def restore() -> None:
-        Publisher.publish = publish
+        for owner, name, method in present:
+            setattr(owner, name, method)
 
     return restore
 
@@ -589,11 +550,8 @@ def execute_ready(executor: Executor) -> bool:
     """Execute the next callback that is ready on a SingleThreadedExecutor, without waiting.
 
     It goes in rounds. At the beginning of each it looks which entities are ready, and then executes one
-    callback of each of them.
+    callback of each of them. Return whether a callback was executed, or else the round is over.
     Relies on `wait_for_ready_callbacks`, which is documented for executors of users.
-
-    Returns:
-        Whether a callback was executed. False: a round is over.
     """
     try:
         task, *_ = executor.wait_for_ready_callbacks(timeout_sec=0)

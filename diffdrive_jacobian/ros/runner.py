@@ -1,4 +1,4 @@
-"""The runner of nodes in real time: context, executor, loop, shutdown.
+"""Runners of nodes: context, executor, loop, shutdown. `lockstep.runner` has the one of simulated time.
 
 Signals are counted by the handlers of `signals`. Those of rclpy would shut the context down before a
 node can publish its last zero.
@@ -6,42 +6,45 @@ node can publish its last zero.
 
 from __future__ import annotations
 
+import math
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from itertools import pairwise
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.exceptions import NameValidationException, ParameterException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
+from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 
 from diffdrive_jacobian.errors import UserError as UserError
-from diffdrive_jacobian.ros.guarded_executor import GuardedExecutor, NodeExecutor
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.ros.fastdds_profiles import withdraw
+from diffdrive_jacobian.ros.guarded_executor import GuardedExecutor
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.node import ParameterizedNode
-from diffdrive_jacobian.ros.node_runner import MAX_NAME_LENGTH, NodeRunner
-from diffdrive_jacobian.ros.parameters import use_files
-from diffdrive_jacobian.ros.rclpy_internals import UnknownROSArgsError, events_executor, reason
+from diffdrive_jacobian.ros.parameters import report_unknown, use_files
+from diffdrive_jacobian.ros.rclpy_internals import RCLError, UnknownROSArgsError, events_executor, reason
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 
+N = TypeVar('N', bound=Node)
+
+MAX_NAME_LENGTH = 247
+"""Longest name of a topic or service, with its leading slash, that Fast DDS can have (characters)."""
 MAX_DOMAIN_ID = 232
 """Largest domain id. The ports of larger ones do not exist."""
 CHECK_PERIOD = 0.1
 """Longest time between two checks of the condition of the loop (s)."""
-RULES = {
-    '-p': 'NAME:=VALUE',
-    '--param': 'NAME:=VALUE',
-    '-r': 'OLD:=NEW',
-    '--remap': 'OLD:=NEW',
-}
+RULES = {'-p': 'NAME:=VALUE', '--param': 'NAME:=VALUE', '-r': 'OLD:=NEW', '--remap': 'OLD:=NEW'}
 """Form of the rule after each flag."""
-
-
 DISCOVERY = (
     'ROS_AUTOMATIC_DISCOVERY_RANGE',
     'ROS_LOCALHOST_ONLY',
@@ -49,6 +52,9 @@ DISCOVERY = (
     'ROS_DISCOVERY_SERVER',
 )
 """Variables that choose what is discovered. The others take precedence over the first."""
+
+
+# --- Contexts
 
 
 @contextmanager
@@ -114,10 +120,7 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
 
 
 def _rule_error(arguments: Sequence[str]) -> str:
-    """Describe a rule without `:=`, or a namespace without its slash. Empty: there is none.
-
-    The error of rcl gives numbers of its lexemes instead.
-    """
+    """Describe a rule without `:=`, or a namespace without its slash: rcl gives numbers of lexemes."""
     for flag, rule in pairwise(arguments):
         if flag not in RULES:
             continue
@@ -135,11 +138,7 @@ def _rule_error(arguments: Sequence[str]) -> str:
 
 
 def _check_name_length(rule: str) -> None:
-    """Check the length of the new name in a remap rule. The error of rcl does not contain the name.
-
-    Raises:
-        UserError: The name is longer than that of a topic, service, node or namespace can be.
-    """
+    """Check the length of the new name in a remap rule. The error of rcl does not contain the name."""
     name = rule.rpartition(':=')[2]
     length = len(name) + (not name.startswith('/'))
     if length > MAX_NAME_LENGTH:
@@ -149,37 +148,110 @@ def _check_name_length(rule: str) -> None:
         )
 
 
-def make_executor(context: Context, *, isolated: bool, with_info: bool = False) -> NodeExecutor:
-    """Return an executor: the SingleThreadedExecutor if rclpy has no EventsExecutor, else as follows.
-
-    Args:
-        context: The context of its nodes.
-        isolated: Whether the nodes are isolated from other processes. Then it is an EventsExecutor.
-            Nodes that others can flood get a GuardedExecutor.
-        with_info: Whether callbacks receive message info, with the time of receipt. Then it is a
-            SingleThreadedExecutor.
-    """
-    events: NodeExecutor | None = None if with_info else events_executor(context)
-    if events is None:
-        single: NodeExecutor = SingleThreadedExecutor(context=context)
-        return single
-    return events if isolated else GuardedExecutor(context, events)
+# --- Runners
 
 
-@contextmanager
-def running(context: Context, *, isolated: bool, with_info: bool = False) -> Iterator[Runner]:
-    """Create a runner. At the end stop and destroy its nodes.
+class NodeRunner(ABC):
+    """Nodes of one context, and the loop that executes their callbacks."""
 
-    Args:
-        context: The context of the nodes.
-        isolated: As for `make_executor`.
-        with_info: As for `make_executor`.
-    """
-    runner = Runner(context, make_executor(context, isolated=isolated, with_info=with_info))
-    try:
-        yield runner
-    finally:
-        runner.close()
+    discovery: ClassVar[float] = 0.0
+    """Time without a newly discovered subscription after which further ones are unlikely (s)."""
+
+    def __init__(self, context: Context) -> None:
+        """Start without nodes. They must be created in `context`."""
+        self.context = context
+        self._nodes: list[Node] = []
+        self._unknown_reported = False
+
+    @abstractmethod
+    def seconds(self) -> float:
+        """Return the time of the nodes, from an arbitrary zero (s)."""
+
+    @abstractmethod
+    def settle(self) -> None:
+        """Execute the callbacks that are due in lockstep. No time passes."""
+
+    @abstractmethod
+    def _add(self, node: Node) -> None:
+        """Execute the callbacks of a node from now on."""
+
+    @abstractmethod
+    def _remove(self, node: Node) -> None:
+        """Execute no more callbacks of a node, and destroy it."""
+
+    @abstractmethod
+    def _spin_once(self) -> None:
+        """Wait for a callback for a short time and execute it, or let simulated time advance once."""
+
+    def add(self, create: Callable[[], N]) -> N:
+        """Create a node in `context` and add it.
+
+        Raises:
+            UserError: The user gave an invalid name, parameter or quality of service.
+        """
+        try:
+            node = create()
+        except NameValidationException as error:
+            # Its lines: the kind of name and the rule, the name, a mark under the place.
+            rule, name, *_ = str(error).splitlines()
+            raise UserError(f'{rule} {printable(name.strip())}') from error
+        except (ParameterError, ParameterException, InvalidQosOverridesError) as error:
+            raise UserError(str(error)) from error
+        except RCLError as error:
+            why = reason(error)
+            if 'length should not exceed' in why:
+                # Each part was short enough, see `ros_context`.
+                why += f'; a name with its namespace must have at most {MAX_NAME_LENGTH} characters'
+            raise UserError(why) from error
+        withdraw()
+        self._nodes.append(node)
+        self._add(node)
+        return node
+
+    def remove(self, node: Node) -> None:
+        """Remove and destroy a node that was added."""
+        self._nodes.remove(node)
+        self._remove(node)
+
+    def turns(
+        self, *, timeout: float = math.inf, signals: Signals | None = None, handled: int = 0
+    ) -> Iterator[float]:
+        """Execute callbacks, and yield the time of the nodes (s) often, for a time or until a signal.
+
+        It yields before the first callback, in real time after each one and several times a second, in
+        lockstep at each simulated time. It also ends when the context is shut down.
+
+        Args:
+            timeout: Longest time (s).
+            signals: Counter of the signals that end it. None: no signal does.
+            handled: Number of these signals that were caught before and do not end it.
+        """
+        if not self._unknown_reported:
+            self._unknown_reported = True
+            report_unknown([node for node in self._nodes if isinstance(node, ParameterizedNode)])
+        deadline = self.seconds() + timeout
+        self.settle()
+        while True:
+            yield self.seconds()
+            if signals is not None and signals.count > handled:
+                return
+            if deadline < math.inf and self.seconds() > deadline:
+                return
+            try:
+                self._spin_once()
+            except ExternalShutdownException:
+                return
+
+    def spin(
+        self,
+        until: Callable[[], bool],
+        *,
+        timeout: float = math.inf,
+        signals: Signals | None = None,
+        handled: int = 0,
+    ) -> bool:
+        """Execute callbacks until a condition is true, or as `turns` ends. Return whether it is true."""
+        return any(until() for _ in self.turns(timeout=timeout, signals=signals, handled=handled))
 
 
 class Runner(NodeRunner):
@@ -188,7 +260,7 @@ class Runner(NodeRunner):
     discovery: ClassVar[float] = 0.3
     """Participants of one machine discover each other in tens of ms, on a busy one in hundreds."""
 
-    def __init__(self, context: Context, executor: NodeExecutor) -> None:
+    def __init__(self, context: Context, executor: Executor | GuardedExecutor) -> None:
         """Start without nodes."""
         super().__init__(context)
         self._executor = executor
@@ -223,3 +295,31 @@ class Runner(NodeRunner):
         self._executor.shutdown()
         for node in self._nodes:
             node.destroy_node()
+
+
+def make_executor(
+    context: Context, *, isolated: bool, with_info: bool = False
+) -> Executor | GuardedExecutor:
+    """Return an executor: the SingleThreadedExecutor if rclpy has no EventsExecutor, else as follows.
+
+    Args:
+        context: The context of its nodes.
+        isolated: Whether the nodes are isolated from other processes. Then it is an EventsExecutor.
+            Nodes that others can flood get a GuardedExecutor.
+        with_info: Whether callbacks receive message info, with the time of receipt. Then it is a
+            SingleThreadedExecutor.
+    """
+    events = None if with_info else events_executor(context)
+    if events is None:
+        return SingleThreadedExecutor(context=context)
+    return events if isolated else GuardedExecutor(context, events)
+
+
+@contextmanager
+def running(context: Context, *, isolated: bool, with_info: bool = False) -> Iterator[Runner]:
+    """Create a runner with the executor of `make_executor`. At the end stop and destroy its nodes."""
+    runner = Runner(context, make_executor(context, isolated=isolated, with_info=with_info))
+    try:
+        yield runner
+    finally:
+        runner.close()

@@ -35,12 +35,7 @@ def ignoring_invalid(
     """Return a callback for serialized messages that ignores invalid ones and those beyond `MAX_SIZE`.
 
     For each message that it cannot decode, the middleware would write several lines to standard error.
-
-    Args:
-        codec: What is read of the messages.
-        message_type: Their class.
-        callback: Called with each value.
-        refused: Called if a message has an invalid value.
+    `refused` is called if a message has an invalid value.
     """
     read = codec.reader(message_type, deserialize_message)
 
@@ -75,14 +70,10 @@ def decoding(
     refused: Callable[[DecodingError], None],
     numbers: Interleaving | None = None,
 ) -> Callable[..., None]:
-    """Return a callback for serialized messages.
+    """Return a callback for serialized messages, which calls another one with their fields.
 
-    Args:
-        message_type: Type of the messages.
-        fields: Paths of the fields that are read.
-        callback: Called with the fields, one argument each.
-        refused: Called instead if the bytes are not a message of this type.
-        numbers: Receives the sequence number of each message.
+    `refused` is called instead if the bytes are not a message of this type. `numbers` receives the
+    sequence number of each message.
     """
     read = reader(message_type, fields)
 
@@ -100,12 +91,7 @@ def decoding(
         def decode_numbered(data: bytes, info: Mapping[str, Any]) -> None:
             # None where the middleware does not number messages.
             numbers.number = info.get('publication_sequence_number')
-            try:
-                values = read(data)
-            except DecodingError as error:
-                refused(error)
-                return
-            callback(*values)
+            decode(data)
 
         chosen = with_message_info(decode_numbered)
     # Reports name a callback.

@@ -1,4 +1,4 @@
-"""A timeout on the input of a node."""
+"""Timeouts of the input of a node: messages that stay away, and commands that are too old."""
 
 from __future__ import annotations
 
@@ -8,7 +8,38 @@ from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
 
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.ros.rclpy_internals import restart_timer
+from diffdrive_jacobian.time_units import seconds
+
+
+def command_time(stamp: int, now: int, last: int, timeout: int) -> int:
+    """Return when a velocity command takes effect (ns): at its stamp, without one at its receipt.
+
+    Args:
+        stamp: Stamp of the command (ns); 0: none.
+        now: Current time (ns).
+        last: Time at which the last command took effect (ns).
+        timeout: Largest age of a command (ns); 0: no limit.
+
+    Raises:
+        MessageError: The stamp is in the future, older than the last command or older than the timeout.
+    """
+    if stamp == 0:
+        return now
+    if stamp > now:
+        raise MessageError(f'its stamp is {seconds(stamp - now):.6f} s in the future')
+    if timeout and now - stamp > timeout:
+        raise MessageError(
+            f'its stamp is {seconds(now - stamp):.6f} s old, more than the timeout of '
+            f'{seconds(timeout):g} s'
+        )
+    if stamp < last:
+        raise MessageError(
+            f'its stamp is {seconds(last - stamp):.6f} s older than the last command, stop, reset of '
+            'the pose or change of parameters'
+        )
+    return stamp
 
 
 class Watchdog:
@@ -19,12 +50,7 @@ class Watchdog:
     """
 
     def __init__(self, node: Node, callback: Callable[[], None]) -> None:
-        """Create it. `start` enables it.
-
-        Args:
-            node: The node whose clock counts.
-            callback: Called when the timeout expires.
-        """
+        """Create it. `start` enables it."""
         self._clock = node.get_clock()
         self._callback = callback
         self._timeout = 0
@@ -43,11 +69,11 @@ class Watchdog:
     def change_timeout(self, timeout: int) -> None:
         """Change the timeout (ns); 0: it never expires. The time since it was fed counts."""
         expired = bool(self._timeout) and not self._running
-        self._timeout = timeout
         if not timeout:
-            self._running = False
-            self._timer.cancel()
-        elif not expired:
+            self.stop()
+            return
+        self._timeout = timeout
+        if not expired:
             self._wait_for_rest()
 
     def feed(self, now: int) -> None:

@@ -17,8 +17,8 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_POSITION
 from diffdrive_jacobian.numerics import fields
 from diffdrive_jacobian.numerics.fields import Check, between, finite, inside, integer, one_of
-from diffdrive_jacobian.parameters.configurations import configurations
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, specifications
+from diffdrive_jacobian.parameters.file import configurations
 from diffdrive_jacobian.tools._output import note
 
 if TYPE_CHECKING:

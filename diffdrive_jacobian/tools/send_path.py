@@ -22,11 +22,11 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         path = path.timed(options.speed)
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
-        from diffdrive_jacobian.nodes.remote_goal import send_path
+        from diffdrive_jacobian.nodes.remote_goal import send_goal
 
     relative = _cli.is_relative(options.path) and not options.frame
     what = f'path {options.path}'
-    return send(PROGRAM, what, send_path, options, signals, path=path, relative=relative)
+    return send(PROGRAM, what, send_goal, options, signals, goal=path, relative=relative)
 
 
 def _parser() -> _cli.Parser:

@@ -75,11 +75,6 @@ def test_each_odometry_is_answered_by_the_law_chosen_at_the_start(lockstep, name
     assert controller.node.waypoint == 1
 
 
-def test_document_as_law_and_a_point_in_front_are_the_defaults(lockstep):
-    node = Controller(lockstep).node
-    assert [node.get_parameter(name).value for name in ('controller', 'offset')] == ['go_to_goal', 0.1]
-
-
 def test_the_command_after_a_switch_is_the_new_laws_and_the_goal_goes_on(lockstep):
     controller = Controller(lockstep)
     controller.send(goal(1.0, 0.4, 2.0))
@@ -110,7 +105,7 @@ def test_gains_and_limits_at_the_ends_of_their_range_give_finite_commands(lockst
 # --- Where a goal is reached
 
 
-@pytest.mark.parametrize(('first', 'second'), PAIRS)
+@pytest.mark.parametrize(('first', 'second'), NEXT)
 def test_what_counts_as_arrived_is_switched_too(lockstep, first, second):
     controller = Controller(lockstep, controller=first, offset=0.5)
     axle, ahead = (1.0, 0.0, 0.0), (0.5, 0.0, 0.0)
@@ -119,15 +114,6 @@ def test_what_counts_as_arrived_is_switched_too(lockstep, first, second):
     assert change(controller.node, controller=second).successful
     assert controller.at(*(ahead if second == 'offset_point' else axle)) == (0.0, 0.0)
     assert controller.statuses[-1] == (0, SUCCEEDED)
-
-
-def test_another_offset_is_another_place_to_arrive(lockstep):
-    controller = Controller(lockstep, controller='offset_point')
-    for offset in (0.1, -0.4, 2.0):
-        assert change(controller.node, offset=offset).successful
-        controller.send(goal(1.0, 0.0))
-        assert controller.at(1.0 - offset - math.copysign(0.021, offset), 0.0) != (0.0, 0.0)
-        assert controller.at(1.0 - offset - math.copysign(0.019, offset), 0.0) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize('name', LAWS)
@@ -153,8 +139,9 @@ def test_where_the_heading_counts_the_robot_turns_in_place_at_the_end(lockstep, 
 # --- Drives through all three nodes
 
 
-@pytest.mark.parametrize('use_heading', [False, True], ids=['position', 'heading'])
-@pytest.mark.parametrize('name', LAWS)
+@pytest.mark.parametrize(
+    ('name', 'use_heading'), [('go_to_goal', True), ('offset_point', False), ('pose', False)]
+)
 def test_a_robot_is_driven_as_by_the_pure_functions(lockstep, name, use_heading):
     topics, start, target = Topics(lockstep), (0.0, 0.0, math.pi), (0.5, 0.3, -2.0)
     gains = {'kp': 12.0, 'kv': 4.0, 'offset': 0.2}
@@ -175,8 +162,7 @@ def test_a_robot_is_driven_as_by_the_pure_functions(lockstep, name, use_heading)
         here = here if command is None else se2.integrate(here, command, 0.02)
     assert command is None
     x, y, theta = pose_of(topics.odom[-1])
-    if not (use_heading and name == 'offset_point'):
-        assert math.dist(point((x, y, theta), arrival.offset), target[:2]) <= 0.02
+    assert math.dist(point((x, y, theta), arrival.offset), target[:2]) <= 0.02
     assert (abs(se2.wrap_angle(theta - target[2])) <= 0.02) == takes_heading
 
 

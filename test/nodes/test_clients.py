@@ -17,6 +17,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from support.ros_messages import goal, goals, odometry, receive, value_of
 
+from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.messages.codecs import (
     GOAL_STATUS,
     GOALS,
@@ -26,23 +27,24 @@ from diffdrive_jacobian.messages.codecs import (
 )
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.nodes import standstill
+from diffdrive_jacobian.nodes import remote_goal
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.goal_client import (
-    DRIVEN_POINT_PARAMETERS,
+from diffdrive_jacobian.nodes.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, driven_offset
+from diffdrive_jacobian.nodes.remote_goal import (
     SILENCE,
-    GoalClient,
-    driven_offset,
+    GoalResult,
+    RemoteProgress,
+    Result,
+    Standstill,
+    _Session,
     duplicates,
     loss,
 )
-from diffdrive_jacobian.nodes.remote_goal import GoalResult, Result, _Session, _Silent
-from diffdrive_jacobian.nodes.standstill import Standstill
 from diffdrive_jacobian.parameters.declaration import ParameterError
-from diffdrive_jacobian.ros import liveness, serialization
-from diffdrive_jacobian.ros.liveness import LONGEST_STEP, PERIOD, Liveness
+from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.runner import discovery_off, ros_context, running
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
+from diffdrive_jacobian.ros.service_client import LONGEST_STEP, PENDING, PERIOD, Liveness
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import send_goal as sending
 
@@ -116,7 +118,7 @@ def test_distance_is_that_of_the_point_the_controller_drives(ros):
     unknown = Liveness(ros.peer, ['/go_to_goal'], ('controller', 'no_such_parameter'))
     ros.until(lambda: watch.silence() is None or watch.values, 'the parameters are reported')
     assert watch.values == {'/go_to_goal': {'controller': 'offset_point', 'offset': 0.25}}
-    client.set_controller_parameters(watch.values['/go_to_goal'])
+    client.arrival = Arrival(offset=driven_offset(watch.values['/go_to_goal']))
     receive(client, '/odom', odometry(0.0, 0.0, 0.0))
     assert client.distance == 0.75
     assert node.arrival.offset == driven_offset(watch.values['/go_to_goal'])
@@ -159,12 +161,12 @@ def watch(ros, clock):
 
 def answered(ros, watch, clock):
     """Wait for another answer: the silence ends."""
-    watch._answered = False
+    watch.answered = False
 
     def over():
         clock.now += 0.1
         watch.silence()
-        return watch._answered
+        return watch.answered
 
     ros.until(over, 'an answer')
 
@@ -189,8 +191,8 @@ def test_a_node_that_is_not_served_falls_silent_and_comes_back(ros, clock, watch
     for _ in range(200):
         clock.now += 1.0
         watch.silence()
-    assert len(watch._pending) == liveness.PENDING
-    assert len(watch._clients['/go_to_goal']._pending_requests) == liveness.PENDING
+    assert len(watch._pending) == PENDING
+    assert len(watch._clients['/go_to_goal']._pending_requests) == PENDING
     ros.executor.add_node(node)
     answered(ros, watch, clock)
 
@@ -317,10 +319,10 @@ def test_each_standstill_is_detected_once():
 
 
 def test_a_goal_of_a_robot_that_does_not_move_is_reported(monkeypatch):
-    monkeypatch.setattr(standstill, 'PATIENCE', 0.3)
+    monkeypatch.setattr(remote_goal, 'STANDSTILL_PATIENCE', 0.3)
     signals, seconds = Signals(), []
 
-    class Progress(_Silent):
+    class Progress(RemoteProgress):
         def standing(self, duration):
             seconds.append(duration)
             signals.count += 1

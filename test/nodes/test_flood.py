@@ -79,13 +79,5 @@ def test_the_benchmark_floods_topics_and_services_that_exist(benchmark):
             assert {f'/{name}', f'/{node_name}/{name}'} & (topics | services), case
 
 
-def test_the_benchmark_names_what_misses_its_goal(benchmark):
-    figures = {'flood': 1e5, 'odometry': 49.5, 'gap': 300.0, 'stop': 100.0, 'memory': 2.0}
-    assert benchmark.missed(figures) == []
-    assert 'MISSED' not in benchmark.line(figures)
-    figures |= {'odometry': 49.4, 'service': 101.0}
-    assert benchmark.line(figures).endswith('service  101 ms,  +2.0 MB MISSED: odometry, service')
-
-
 def moves(message):
     return message.twist.twist.linear.x != 0.0

@@ -172,14 +172,6 @@ def test_quality_of_service_can_be_overridden(add):
         assert '\n' not in message
 
 
-def test_two_topics_of_a_node_with_one_name_are_reported(ros):
-    with pytest.raises(ParameterError) as caught:
-        ros.add(VirtualRobot, cli_args=['--ros-args', '-r', 'cmd_vel:=odom'])
-    assert str(caught.value).startswith('two topics of this node have the name /odom, one with type ')
-    for name in ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist'):
-        assert name in str(caught.value)
-
-
 def test_the_last_word_counts(tmp_path):
     path = tmp_path / 'parameters.yaml'
     path.write_text('/**/go_to_goal: {ros__parameters: {kp: 5.0, kv: 2, xy_goal_tolerance: 0.1}}')

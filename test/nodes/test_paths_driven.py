@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import re
-import signal
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from diffdrive_jacobian.drives import drive, in_lockstep
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
-from diffdrive_jacobian.nodes.remote_goal import Result, send_path
+from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.plots.run_figure import figure
 from diffdrive_jacobian.plots.run_table import write_csv
@@ -35,7 +34,7 @@ TAKES_TIME = {'linear.x.max_acceleration': 0.3, 'wheel_lag': 0.2, 'command_delay
 
 @pytest.mark.slow
 def test_a_robot_that_takes_time_stops_at_the_end():
-    known, planned = {**TAKES_TIME, 'stop_in_time': True}, circle_path(0.15)
+    known, planned = {**TAKES_TIME, 'stop_in_time': True}, line_path(0.5)
     outcome = drive(planned, lockstep=True, parameters=known, robot_parameters=TAKES_TIME)
     assert outcome.arrived
     assert not outcome.moving
@@ -53,30 +52,30 @@ def test_a_robot_that_still_moves_is_not_said_to_have_stopped(capsys):
 
 @pytest.mark.parametrize('law', ['pure_pursuit', 'kanayama', 'offset_point', 'dynamic_feedback'])
 def test_a_path_that_turns_back_is_driven_to_its_end(law):
-    there_and_back = Path(np.array([(0.0, 0.0), (0.3, 0.0), (0.6, 0.0), (0.3, 0.0), (0.0, 0.0)]))
+    there_and_back = Path(np.array([(0.0, 0.0), (0.2, 0.0), (0.4, 0.0), (0.2, 0.0), (0.0, 0.0)]))
     how = {'path_controller': law, 'path_speed': 0.4}
     outcome = drive(there_and_back, lockstep=True, timeout=60.0, parameters=how)
     assert outcome.arrived
-    assert outcome.seconds > 2.8
+    assert outcome.seconds > 1.8
 
 
 @pytest.mark.slow
 def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
     bag = tmp_path / 'circle'
-    arguments = ['--path', 'circle:0.5', '--speed', '0.4', '--lockstep', '-o', str(bag), '--no-plot']
+    arguments = ['--path', 'circle:0.25', '--speed', '0.4', '--lockstep', '-o', str(bag), '--no-plot']
     assert main(arguments, Signals()) == 0
     assert 'm from the end of the path, after at most 0.00' in capsys.readouterr().out
     one = timeline(read_run(bag))
     ((planned,), series) = one.paths, one.run.odometry.values
-    assert planned.length == pytest.approx(math.pi)
-    on_path = one.progress > 1.0
-    assert on_path.sum() > 200
-    speeds = series[on_path & (one.progress < 2.9), 3]
+    assert planned.length == pytest.approx(math.pi / 2.0, rel=1e-3)
+    on_path = one.progress > 0.5
+    assert on_path.sum() > 100
+    speeds = series[on_path & (one.progress < 1.3), 3]
     assert speeds == pytest.approx(np.full(len(speeds), 0.4))
     assert abs(one.across[on_path]).max() < 0.01
     assert abs(one.path_heading_error[on_path]).max() < 0.02
     assert np.isnan(one.along).all()
-    assert (one.path >= 0).sum() == np.isfinite(one.across).sum() > 350
+    assert (one.path >= 0).sum() == np.isfinite(one.across).sum() > 150
     # Until the robot has arrived.
     assert one.path[-1] == -1
     assert one.progress[one.path >= 0][-1] == pytest.approx(planned.length, abs=0.021)
@@ -87,7 +86,7 @@ def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
     assert (row['along_path_m'], row['distance_m']) == ('', '')
     plane, *panels = figure([one.run]).axes
     assert [panel.get_ylabel() for panel in panels[:2]] == ['across path [m]', 'heading to path [rad]']
-    assert any(np.allclose(np.ptp(line.get_data(), axis=1), 1.0, atol=1e-3) for line in plane.lines)
+    assert any(np.allclose(np.ptp(line.get_data(), axis=1), 0.5, atol=1e-3) for line in plane.lines)
 
 
 def test_the_true_distance_of_a_robot_that_drifts_is_reported(capsys):
@@ -129,9 +128,9 @@ def test_send_path_follows_a_path_cancels_a_long_one_and_reports_a_refused_one()
     with in_lockstep() as runner:
         runner.add(lambda: VirtualRobot(context=runner.context))
         runner.add(lambda: GoToGoal(context=runner.context))
-        arrived = send_path(circle_path(0.15), runner=runner, relative=True)
-        canceled = send_path(line_path(5.0), runner=runner, relative=True, timeout=1.0)
-        refused = send_path(line_path(5.0), runner=runner, frame='map')
+        arrived = send_goal(circle_path(0.15), runner=runner, relative=True)
+        canceled = send_goal(line_path(5.0), runner=runner, relative=True, timeout=1.0)
+        refused = send_goal(line_path(5.0), runner=runner, frame='map')
     assert arrived.arrived
     assert arrived.topic == '/path'
     assert arrived.across < 0.01
@@ -140,7 +139,7 @@ def test_send_path_follows_a_path_cancels_a_long_one_and_reports_a_refused_one()
     assert 4.0 < canceled.distance < 5.0
     assert (refused.status, refused.across) == (GoalState.ABORTED, None)
     with pytest.raises(ValueError, match='path must have at most 10000 poses, got 20001'):
-        send_path(Path(np.column_stack([np.arange(20_001.0)] * 2)))
+        send_goal(Path(np.column_stack([np.arange(20_001.0)] * 2)))
 
 
 def test_a_trajectory_is_sent_with_stamps_where_the_robot_is(ros):
@@ -217,19 +216,6 @@ def test_a_path_that_was_refused_or_is_none_never_counts(tmp_path):
 def world(tmp_path):
     with open_world(tmp_path) as opened:
         yield opened
-
-
-@pytest.mark.process
-def test_ctrl_c_cancels_a_path(world):
-    drive = Drive(world)
-    sender = world.start('send_path', 'circle:1.0')
-    sender.until_says('m to go')
-    drive.harness.until(drive.drives, 'the robot drives')
-    sender.signal(signal.SIGINT)
-    assert sender.exit(5.0) == 130
-    assert sender.last_line == 'canceled: the robot was stopped'
-    assert 'Traceback' not in sender.stderr
-    drive.until_canceled()
 
 
 @pytest.mark.process

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
-import pytest
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
@@ -90,37 +88,7 @@ def test_bridge_stops_the_wheels_once_commands_cease(ros, executor_kind):
     assert last - first >= SECOND // 10
 
 
-def test_rate_that_keeps_changing_starves_nobody(ros, executor_kind):
-    odom = ros.listen(Odometry, 'odom')
-    robot = ros.add(VirtualRobot, parameters={'publish_rate': 20.0})
-    rates = itertools.cycle([21.0, 20.0])
-    changed = []
-    ros.peer.create_timer(
-        0.01,
-        lambda: changed.append(robot.set_parameters([Parameter('publish_rate', value=next(rates))])),
-    )
-    ros.until(lambda: len(odom) >= 10, 'odometry')
-    assert len(changed) > len(odom)
-
-
 # --- One executor
-
-
-def test_two_robots_in_two_namespaces_do_not_disturb_each_other(ros):
-    targets = {'one': (0.5, 0.2), 'two': (-0.2, -0.5)}
-    topics = {name: Topics(ros, name) for name in targets}
-    for name in targets:
-        team(ros, name, **GAINS)
-    for name, target in targets.items():
-        ros.talk(PoseStamped, f'{name}/goal_pose').publish(goal(*target))
-    ros.until(
-        lambda: all(
-            one.statuses[-1:] == [SUCCEEDED] and at_rest(one.odom[-1]) for one in topics.values()
-        ),
-        'both arrive',
-    )
-    for name, target in targets.items():
-        assert pose_of(topics[name].odom[-1])[:2] == pytest.approx(target, abs=NEAR)
 
 
 # --- A world without /clock

@@ -139,16 +139,6 @@ def test_every_pose_lies_on_the_exact_arc_of_the_command(lockstep, robot_at, int
         start, angles = se2.integrate(start, driven, 0.2), angles + speeds * 0.2
 
 
-def test_sixty_second_arc_is_exact(lockstep, robot_at):
-    topics = Topics(lockstep)
-    robot_at(cmd_vel_timeout=0.0, publish_rate=1.0)
-    lockstep.publish('cmd_vel', twist(0.22, 0.5))
-    lockstep.run_for(60.0)
-    radius, turn = 0.22 / 0.5, 0.5 * 60.0
-    expected = [radius * math.sin(turn), radius * (1.0 - math.cos(turn)), se2.wrap_angle(turn)]
-    assert pose_of(topics.odom[-1]) == pytest.approx(expected, abs=1e-13)
-
-
 def test_publish_rate_changes_no_bit_of_the_pose(lockstep, robot_at):
     names, commands = ['a', 'b', 'c'], way(1, 12)
     for name, rate in zip(names, (7.0, 50.0, 333.0), strict=True):

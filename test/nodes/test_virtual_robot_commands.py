@@ -47,21 +47,15 @@ def driving(lockstep, robot_at):
 # --- Commands
 
 
-def test_invalid_twists_are_dropped(lockstep, robot_at, capfd):
+def test_what_a_differential_drive_cannot_do_is_ignored(lockstep, robot_at):
     topics = Topics(lockstep)
     robot_at(cmd_vel_timeout=0.0)
-    fields = [f'{part}.{axis}' for part in ('linear', 'angular') for axis in 'xyz']
-    cases = [(name, bad) for name in fields for bad in (math.nan, -math.inf)]
-    for bad in (1000.0000001, -1000.0000001, 1e308):
-        cases += [(name, bad) for name in ('linear.x', 'angular.z')]
-    for name, bad in cases:
-        lockstep.publish('cmd_vel', spoiled(twist(0.5, 0.5), name, bad))
-        assert topics.applied == [], (name, bad)
-    assert 'command dropped: twist must be finite, got linear' in capfd.readouterr().err
-    # What a differential drive cannot do is passed over, and the largest that is plausible is driven.
     for name in ('linear.y', 'linear.z', 'angular.x', 'angular.y'):
         lockstep.publish('cmd_vel', spoiled(twist(0.5, 0.25), name, 1e300))
         assert twists(topics.applied)[-1] == (0.5, 0.25)
+        lockstep.publish('cmd_vel', spoiled(twist(0.1, 0.1), name, math.nan))
+    assert len(topics.applied) == 4
+    # The largest that is plausible.
     lockstep.publish('cmd_vel', twist(-1000.0, 1000.0))
     assert twists(topics.applied)[-1] == (-1000.0, 1000.0)
 
@@ -163,8 +157,9 @@ def test_commands_late_by_less_than_their_distance_give_the_path_of_their_stamps
 
 
 @late
-@pytest.mark.parametrize('rate', [3.0, 50.0])
-@pytest.mark.parametrize('timeout', [1e-10, 1e-9, 0.0333, 0.5])
+@pytest.mark.parametrize(
+    ('timeout', 'rate'), [(1e-10, 50.0), (1e-9, 3.0), (0.0333, 50.0), (0.5, 50.0), (0.5, 3.0)]
+)
 def test_timeout_strikes_at_its_own_time_whatever_the_rate(lockstep, robot_at, timeout, rate):
     topics = Topics(lockstep)
     robot_at(cmd_vel_timeout=timeout, publish_rate=rate)
@@ -177,16 +172,6 @@ def test_timeout_strikes_at_its_own_time_whatever_the_rate(lockstep, robot_at, t
     driven = se2.integrate(3 * [0.0], [1.0, -3.0], held / SECOND)
     assert topics.odom[-1].pose.pose == pose_message(driven)
     assert at_rest(topics.odom[-1])
-
-
-@late
-def test_without_a_timeout_a_command_holds_for_ever(lockstep, robot_at):
-    topics = Topics(lockstep)
-    robot_at(cmd_vel_timeout=0.0, publish_rate=0.1)
-    lockstep.publish('cmd_vel', twist(1.0, 0.0))
-    lockstep.run_for(3600.0)
-    assert len(topics.applied) == 1
-    assert pose_of(topics.odom[-1]).tolist() == [3600.0, 0.0, 0.0]
 
 
 @late

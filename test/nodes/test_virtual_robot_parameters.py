@@ -23,6 +23,8 @@ LIMITS = {
         {'linear__x__max_velocity': 0.5, 'linear__x__min_velocity': 0.0},
         {'max_v': 0.5, 'min_v': 0.0},
     ),
+    # The quotient of a speed and it overflows.
+    'too small': ({'linear__x__max_velocity': 5e-324}, {'min_v': 0.0, 'max_v': 0.0}),
     'turning': ({'angular__z__max_velocity': 1.0}, {'min_omega': -1.0, 'max_omega': 1.0}),
     'clockwise': ({'angular__z__min_velocity': -0.5}, {'min_omega': -0.5}),
     'wheels': ({'max_wheel_velocity': 9.0}, {'max_wheel_speed': 9.0}),

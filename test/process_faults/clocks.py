@@ -7,23 +7,17 @@ clock runs evenly again, the robot arrives.
 
 from __future__ import annotations
 
-import math
 import random
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
-from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import PoseStamped, Twist
-from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
 from support.processes import World
+from support.ros_messages import goal
 
-from process_faults.fuzzed_parameters import finite
 from process_faults.outcome import Outcome, unexpected
-from process_faults.worlds import quiet_world
+from process_faults.worlds import Team, quiet_world, spin
 
 STEP = 0.02
 """Time between two messages on /clock (s)."""
@@ -36,38 +30,16 @@ MOST = 2**31 - 1 - 1e-9
 
 
 class Simulation:
-    """Three nodes in processes that follow a clock."""
+    """A team that follows a clock."""
 
     def __init__(self, world: World) -> None:
-        self.world, self.harness = world, world.harness
-        peer = self.harness.peer
-        self.clocks = [peer.create_publisher(Clock, '/clock', 10) for _ in range(2)]
-        self.heard: dict[str, Any] = {}
-        self.infinite: list[str] = []
-        for topic, kind in (('odom', Odometry), ('cmd_vel', Twist), ('joint_command', JointState)):
-            self._hear(topic, kind)
-        self.statuses = self.harness.listen(GoalStatus, 'goal_status', latched=True)
-        self.goal = peer.create_publisher(PoseStamped, 'goal_pose', 1)
-        simulated = ('--ros-args', '-p', 'use_sim_time:=true')
-        self.nodes = [
-            world.start('virtual_robot', *simulated, '-p', 'command_interface:=wheels'),
-            world.start('wheel_bridge', *simulated),
-            world.start('go_to_goal', *simulated, '-p', 'kp:=6.0', '-p', 'kv:=2.0'),
-        ]
-        for node in self.nodes:
-            node.until_says('subscribed to')
-        for publisher in (*self.clocks, self.goal):
+        self.harness = world.harness
+        self.clocks = [self.harness.peer.create_publisher(Clock, '/clock', 10) for _ in range(2)]
+        self.team = Team(world, use_sim_time='true')
+        for publisher in self.clocks:
             self.harness.until(publisher.get_subscription_count, 'the nodes are there')
         self.now = 0.0
         self._next = 0.0
-
-    def _hear(self, topic: str, kind: Any) -> None:
-        def on_message(message: Any) -> None:
-            self.heard[topic] = message
-            if not finite(message):
-                self.infinite.append(str(message)[:300])
-
-        self.harness.peer.create_subscription(kind, topic, on_message, 1000)
 
     def publish(self, seconds: float, publisher: int = 0) -> None:
         """Publish a time, as a message can hold it."""
@@ -89,33 +61,6 @@ class Simulation:
             self.now += STEP
             self.publish(self.now)
         self.harness.executor.spin_once(timeout_sec=0.001)
-
-    def until(self, condition: Any, what: str) -> None:
-        end = time.monotonic() + 20.0
-        while not condition():
-            assert time.monotonic() < end, f'not within 20 s: {what}'
-            self.tick()
-
-    def send(self, x: float, y: float) -> None:
-        message = PoseStamped()
-        message.pose.position.x, message.pose.position.y, message.pose.orientation.w = x, y, 1.0
-        self.goal.publish(message)
-
-    def arrive(self) -> None:
-        """Send a goal half a metre away, more than once if need be, and wait for the arrival."""
-        sent = -math.inf
-
-        def arrived() -> bool:
-            nonlocal sent
-            if time.monotonic() > sent + 3.0:
-                sent = time.monotonic()
-                self.statuses.clear()
-                at = self.heard['odom'].pose.pose.position
-                self.send(at.x + 0.3, at.y + 0.4)
-            return any(one.status == GoalStatus.STATUS_SUCCEEDED for one in self.statuses)
-
-        self.until(lambda: 'odom' in self.heard, 'the robot publishes odometry')
-        self.until(arrived, 'the robot arrives')
 
 
 # --- What happens to a clock
@@ -143,9 +88,7 @@ def pause(made: Simulation, chance: random.Random) -> str:
 
 
 def silence(made: Simulation, chance: random.Random) -> str:
-    end = time.monotonic() + chance.uniform(0.1, 1.5)
-    while time.monotonic() < end:
-        made.harness.executor.spin_once(timeout_sec=0.01)
+    spin(made.harness, chance.uniform(0.1, 1.5))
     return 'is silent'
 
 
@@ -154,9 +97,7 @@ def disagree(made: Simulation, chance: random.Random) -> str:
     for _ in range(chance.randrange(3, 40)):
         made.publish(made.now)
         made.publish(made.now + ahead, 1)
-        end = time.monotonic() + SETTLED / 5
-        while time.monotonic() < end:
-            made.tick()
+        made.run(SETTLED / 5)
     return f'two of them disagree by {ahead:g} s'
 
 
@@ -164,9 +105,7 @@ def implausible(made: Simulation, chance: random.Random) -> str:
     times = [chance.choice((-1.0, -(2.0**31), MOST, 1e-9, 0.0, 2.0**30)) for _ in range(5)]
     for one in times:
         made.publish(one)
-        end = time.monotonic() + SETTLED
-        while time.monotonic() < end:
-            made.harness.executor.spin_once(timeout_sec=0.005)
+        spin(made.harness, SETTLED)
     return f'has the times {times}'
 
 
@@ -186,25 +125,24 @@ def run(count: int, seed: int = 0) -> Outcome:
     violations: list[str] = []
     with tempfile.TemporaryDirectory(prefix='clocks_') as name, quiet_world(Path(name)) as world:
         made = Simulation(world)
+        nodes = made.team.nodes.values()
         for index in range(count):
-            made.send(50.0, 1.0)
+            made.team.goal.publish(goal(50, 1))
             made.run(chance.uniform(0.05, 0.3))
             # Now and then several at once.
             happened = [EVENTS[index % len(EVENTS)](made, chance)]
             while chance.random() < 0.3:
                 happened.append(chance.choice(EVENTS)(made, chance))
             what = f'the clock {", ".join(happened)}'
-            try:
-                made.arrive()
-            except AssertionError as error:
-                violations.append(f'{what}: {error}')
-            violations += [f'{what}: published {one}' for one in made.infinite[:1]]
-            made.infinite.clear()
-            ended = [node for node in made.nodes if not node.running]
+            if not made.team.arrives(made.tick):
+                violations.append(f'{what}: the robot does not arrive')
+            violations += [f'{what}: published {one}' for one in made.team.infinite[:1]]
+            made.team.infinite.clear()
+            ended = [node for node in nodes if not node.running]
             if ended:
                 violations += [f'{what}: ended: {node.stderr[-300:]!r}' for node in ended]
                 break
-        for node in made.nodes:
+        for node in nodes:
             node.signal(2)
             if node.exit() != 0 or unexpected(node.stderr):
                 violations.append(f'{node.command}: {node.exit()}, {unexpected(node.stderr)!r}')

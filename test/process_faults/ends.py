@@ -18,11 +18,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
 
+from geometry_msgs.msg import PoseStamped, Twist
+from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
 from support import processes
 from support.processes import Child, World
+from support.ros_messages import goal, odometry, twist
 
 from process_faults.outcome import Outcome, spread, unexpected
-from process_faults.worlds import quiet_world
+from process_faults.worlds import moves, quiet_world
 
 LIMIT = 1.0
 """Longest time from a signal to the exit (s)."""
@@ -64,17 +70,11 @@ def _paths(*words: str) -> Callable[[Path, Path], list[str]]:
     return lambda bag, new: [word.replace('BAG', str(bag)).replace('NEW', str(new)) for word in words]
 
 
-NODE_ARGUMENTS = ('--ros-args', '-p')
+WITHOUT_TIMEOUT = ('--ros-args', '-p', 'cmd_vel_timeout:=0.0')
 PROGRAMS = (
-    Program('virtual_robot', _paths(*NODE_ARGUMENTS, 'cmd_vel_timeout:=0.0'), (0,), 'subscribed to'),
+    Program('virtual_robot', _paths(*WITHOUT_TIMEOUT), (0,), 'subscribed to'),
     Program('go_to_goal', _paths(), (0,), 'subscribed to', 'cmd_vel'),
-    Program(
-        'wheel_bridge',
-        _paths(*NODE_ARGUMENTS, 'cmd_vel_timeout:=0.0'),
-        (0,),
-        'subscribed to',
-        'joint_command',
-    ),
+    Program('wheel_bridge', _paths(*WITHOUT_TIMEOUT), (0,), 'subscribed to', 'joint_command'),
     Program('send_goal', _paths('50', '0'), (130, 1), 'm to go|waiting: ', 'cmd_vel'),
     Program('send_path', _paths('line:50'), (130, 1), 'm to go|waiting: ', 'cmd_vel'),
     Program('record_run', _paths('-o', 'NEW'), (0, 130, 1), 'recording to'),
@@ -200,11 +200,11 @@ class Campaign:
                     break
                 traffic.spin(mode == 'busy')
         numbers = [self.chance.choice(SIGNALS) for _ in range(2 if mode == 'twice' else 1)]
-        if not child.running:
+        if child.running:
+            ending.signal(*numbers, pause=self.chance.uniform(0.0, 0.5))
+        else:
             # A calculation that was ready before its end came.
             ending.caught = True
-            return self._violations(program, ending, traffic, new, numbers, mode), ending
-        ending.signal(*numbers, pause=self.chance.uniform(0.0, 0.5))
         return self._violations(program, ending, traffic, new, numbers, mode), ending
 
     def _serve_goals(self) -> None:
@@ -247,12 +247,6 @@ class Traffic:
     """What a program receives and sends while it is ended."""
 
     def __init__(self, harness: Any, program: Program, space: str) -> None:
-        from geometry_msgs.msg import PoseStamped, Twist
-        from nav_msgs.msg import Odometry
-        from rclpy.qos import QoSProfile
-        from rclpy.serialization import serialize_message
-        from sensor_msgs.msg import JointState
-
         self.harness, self.program = harness, program
         self.commands: list[Any] = []
         self._data: list[tuple[Any, bytes]] = []
@@ -263,19 +257,10 @@ class Traffic:
             self._data.append((publisher, serialize_message(message)))
 
         if program.name in ('virtual_robot', 'wheel_bridge'):
-            command = Twist()
-            command.linear.x = 0.2
-            add(Twist, 'cmd_vel', command)
+            add(Twist, 'cmd_vel', twist(0.2, 0.0))
         elif program.name == 'go_to_goal':
-            odometry = Odometry(child_frame_id='base_link')
-            odometry.header.frame_id = 'odom'
-            odometry.pose.pose.orientation.w = 1.0
-            goal = PoseStamped()
-            goal.pose.position.x = 50.0
-            goal.pose.orientation.w = 1.0
-            add(Odometry, 'odom', odometry)
+            add(Odometry, 'odom', odometry(0, 0, 0))
             self._goal = peer.create_publisher(PoseStamped, f'{space}/goal_pose', 1)
-            self._goal_message = goal
         if program.command:
             kind = JointState if program.command == 'joint_command' else Twist
             self._heard = peer.create_subscription(
@@ -293,7 +278,7 @@ class Traffic:
                     publisher.publish(data)
         if self.program.name == 'go_to_goal' and not self.commands and now >= self._next_goal:
             self._next_goal = now + 0.3
-            self._goal.publish(self._goal_message)
+            self._goal.publish(goal(50, 0))
         self.harness.executor.spin_once(timeout_sec=0.005)
 
     def moving(self) -> bool:
@@ -311,12 +296,6 @@ class Traffic:
         while moves(self.commands[-1]) and time.monotonic() < deadline:
             self.harness.executor.spin_once(timeout_sec=0.01)
         return not moves(self.commands[-1])
-
-
-def moves(message: Any) -> bool:
-    if hasattr(message, 'velocity'):
-        return any(message.velocity)
-    return bool(message.linear.x or message.angular.z)
 
 
 def make_bag(folder: Path) -> Path:

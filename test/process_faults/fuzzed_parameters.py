@@ -10,14 +10,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped, Twist
-from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter, parameter_value_to_python
-from sensor_msgs.msg import JointState
+from support.ros_messages import goal, odometry, twist
 
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.parameters.declaration import ParameterError, default_of, specifications
 from diffdrive_jacobian.parameters.nodes import (
     GoToGoalParameters,
@@ -25,25 +26,24 @@ from diffdrive_jacobian.parameters.nodes import (
     WheelBridgeParameters,
 )
 from process_faults.outcome import Outcome, unexpected
-from process_faults.worlds import quiet_world
+from process_faults.worlds import OUTPUTS, finite, quiet_world
 
 NODES = {
     'virtual_robot': VirtualRobotParameters,
     'go_to_goal': GoToGoalParameters,
     'wheel_bridge': WheelBridgeParameters,
 }
+DECLARED: dict[str, dict[str, tuple[Any, Any]]] = {
+    node: {
+        name: (specification, default_of(parameters, field))
+        for name, (field, specification) in specifications(parameters).items()
+    }
+    for node, parameters in NODES.items()
+}
+"""Specification and default of each parameter of each node."""
 TEXTS = (
-    '',
-    'a',
-    'twist',
-    'wheels',
-    'pose',
-    'offset_point',
-    'a' * 256,
-    'a' * 257,
-    '\x1b[2J',
-    '\n',
-    'ä\u202e',
+    *('', 'a', 'twist', 'wheels', 'pose', 'offset_point'),
+    *('a' * 256, 'a' * 257, '\x1b[2J', '\n', 'ä\u202e'),
 )
 NUMBERS = (
     *(0.0, -0.0, 5e-324, 1e-300, 1e-9, 1.0, -1.0, 0.5, 1e6, 1e9, 1.8e308, -1.8e308),
@@ -100,10 +100,9 @@ def permitted(specification: Any, default: Any, value: Any) -> bool:
         return value in specification.choices if specification.choices else 0 < len(value) <= 256
     if value != value:
         return bool(specification.nan_is_none)
-    low = -math.inf if specification.low is None else specification.low
-    high = math.inf if specification.high is None else specification.high
-    above = -math.inf if specification.above is None else specification.above
-    return low <= value <= high and (value > above or above == -math.inf)
+    low, high, above = specification.low, specification.high, specification.above
+    inside = (low is None or low <= value) and (high is None or value <= high)
+    return inside and (above is None or value > above)
 
 
 def same(first: Any, second: Any) -> bool:
@@ -115,7 +114,7 @@ class Fuzzer:
 
     def __init__(self, world: Any, name: str, chance: random.Random) -> None:
         self.name, self.chance, self.harness = name, chance, world.harness
-        self.known = specifications(NODES[name])
+        self.known = DECLARED[name]
         self.names = list(self.known)
         self.child = world.start(name, '--ros-args', '-r', f'__ns:=/{name}')
         self.child.until_says('subscribed to')
@@ -141,9 +140,7 @@ class Fuzzer:
         number = self.chance.choice((2, 3, 5)) if self.chance.random() < ATOMIC else 1
         changes = {}
         for name in self.chance.sample(self.names, number):
-            field, specification = self.known[name]
-            default = default_of(NODES[self.name], field)
-            changes[name] = value_of(self.chance, specification, default)
+            changes[name] = value_of(self.chance, *self.known[name])
         messages = [ParameterMessage(name=name, value=value) for name, value in changes.items()]
         if number == 1:
             (result,) = self._call(self.set, SetParameters.Request(parameters=messages)).results
@@ -158,18 +155,13 @@ class Fuzzer:
     def _check(self, changes: dict[str, ParameterValue], result: Any) -> None:
         given = {name: self._python(value) for name, value in changes.items()}
         what = f'{self.name}: {given!r:.300}'
-        allowed = {
-            name: permitted(
-                self.known[name][1], default_of(NODES[self.name], self.known[name][0]), value
-            )
-            for name, value in given.items()
-        }
+        allowed = [permitted(*self.known[name], value) for name, value in given.items()]
         expected = dict(self.values)
         if result.successful:
             for name, value in given.items():
-                default = default_of(NODES[self.name], self.known[name][0])
-                expected[name] = float(value) if type(default) is float and value is not None else value
-            if not all(allowed.values()) and not self._unchanged(given):
+                double = type(self.known[name][1]) is float and value is not None
+                expected[name] = float(value) if double else value
+            if not all(allowed) and not self._unchanged(given):
                 self.violations.append(f'{what} was accepted')
         elif not result.reason or not result.reason.isprintable() or len(result.reason) > 1000:
             self.violations.append(f'{what} was refused without a clear reason: {result.reason!r:.200}')
@@ -205,65 +197,23 @@ class Fuzzer:
         return future.result()
 
 
-def _odometry() -> Odometry:
-    message = Odometry()
-    message.header.frame_id = 'odom'
-    message.pose.pose.orientation.w = 1.0
-    return message
-
-
-def _goal() -> PoseStamped:
-    message = PoseStamped()
-    message.pose.position.x, message.pose.orientation.w = 2.0, 1.0
-    return message
-
-
-def _twist() -> Twist:
-    message = Twist()
-    message.linear.x, message.angular.z = 0.3, 0.5
-    return message
-
-
 INPUTS: dict[str, list[tuple[str, Any]]] = {
-    'virtual_robot': [('cmd_vel', _twist())],
-    'go_to_goal': [('goal_pose', _goal()), ('odom', _odometry())],
-    'wheel_bridge': [('cmd_vel', _twist())],
+    'virtual_robot': [('cmd_vel', twist(0.3, 0.5))],
+    'go_to_goal': [('goal_pose', goal(2, 0)), ('odom', odometry(0, 0, 0))],
+    'wheel_bridge': [('cmd_vel', twist(0.3, 0.5))],
 }
-OUTPUTS = {
-    'virtual_robot': (Odometry, 'odom'),
-    'go_to_goal': (Twist, 'cmd_vel'),
-    'wheel_bridge': (JointState, 'joint_command'),
-}
-
-
-def finite(message: Any) -> bool:
-    """Return whether all numbers that a node publishes are finite."""
-    if isinstance(message, JointState):
-        return all(map(math.isfinite, message.velocity))
-    twist = message.twist.twist if isinstance(message, Odometry) else message
-    numbers = [twist.linear.x, twist.angular.z]
-    if isinstance(message, Odometry):
-        pose = message.pose.pose
-        numbers += [pose.position.x, pose.position.y, pose.orientation.z, pose.orientation.w]
-        numbers += [*message.pose.covariance, *message.twist.covariance]
-    return all(map(math.isfinite, numbers))
 
 
 def start_up(harness: Any, chance: random.Random, count: int) -> list[str]:
     """Create nodes with fuzzed values as given on the command line."""
-    from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-    from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-    from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-
     classes = {'virtual_robot': VirtualRobot, 'go_to_goal': GoToGoal, 'wheel_bridge': WheelBridge}
     violations = []
     for _ in range(count):
         node_name = chance.choice(list(NODES))
-        known = specifications(NODES[node_name])
+        known = DECLARED[node_name]
         given: dict[str, Any] = {}
         for name in chance.sample(list(known), chance.choice((1, 1, 2))):
-            field, specification = known[name]
-            value = value_of(chance, specification, default_of(NODES[node_name], field))
+            value = value_of(chance, *known[name])
             if 1 <= value.type <= 4:
                 given[name] = parameter_value_to_python(value)
         overrides = [Parameter(name, value=value) for name, value in given.items()]
@@ -277,8 +227,7 @@ def start_up(harness: Any, chance: random.Random, count: int) -> list[str]:
                 violations.append(f'{what}: refused without a clear reason: {error!r:.200}')
             continue
         for name, value in given.items():
-            field, specification = known[name]
-            default = default_of(NODES[node_name], field)
+            specification, default = known[name]
             actual = node.get_parameter(name).value
             if not same(actual, float(value) if type(default) is float else value):
                 violations.append(f'{what}: {name} is {actual!r}')

@@ -12,7 +12,6 @@ import random
 import struct
 import tempfile
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,11 +25,20 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
+from support.ros_messages import (
+    goal,
+    goals,
+    joint_command,
+    odometry,
+    path,
+    placement,
+    twist,
+    twist_stamped,
+)
 
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
-from process_faults.fuzzed_parameters import finite
 from process_faults.outcome import Outcome, unexpected
-from process_faults.worlds import quiet_world
+from process_faults.worlds import OUTPUTS, finite, moves, quiet_world, spin
 
 BURST = 8
 """Messages at once; the queues of the nodes have room for 10."""
@@ -59,11 +67,6 @@ class Input(NamedTuple):
 
 STAMPED = ('-p', 'enable_stamped_cmd_vel:=true')
 SIMULATED = ('-p', 'use_sim_time:=true')
-OUTPUTS = {
-    'virtual_robot': (Odometry, 'odom'),
-    'go_to_goal': (Twist, 'cmd_vel'),
-    'wheel_bridge': (JointState, 'joint_command'),
-}
 INPUTS = (
     Input('virtual_robot', 'cmd_vel', Twist),
     Input('virtual_robot', 'cmd_vel', TwistStamped, STAMPED),
@@ -92,28 +95,19 @@ TOOLS = {
 """Arguments of programs that are not nodes, what they print when they run, and their exit codes."""
 
 
-def valid(kind: Any) -> Any:
-    """Return a message that every node accepts."""
-    if kind in (Twist, TwistStamped):
-        twist = Twist()
-        twist.linear.x, twist.angular.z = 0.2, 0.3
-        return twist if kind is Twist else TwistStamped(twist=twist)
-    if kind is JointState:
-        return JointState(name=['left_wheel_joint', 'right_wheel_joint'], velocity=[1.0, 2.0])
-    if kind in (Clock, GoalStatus):
-        return kind()
-    if kind is Goals:
-        return Goals(goals=[valid(PoseStamped), valid(PoseStamped)])
-    if kind is PathMessage:
-        start = PoseStamped()
-        start.pose.orientation.w = 1.0
-        return PathMessage(poses=[start, valid(PoseStamped)])
-    message = kind()
-    pose = message.pose if kind is PoseStamped else message.pose.pose
-    pose.position.x, pose.orientation.w = 3.0, 1.0
-    if kind is Odometry:
-        message.header.frame_id, message.child_frame_id = 'odom', 'base_link'
-    return message
+VALID = {
+    Twist: twist(0.2, 0.3),
+    TwistStamped: twist_stamped(0.2, 0.3, 0),
+    JointState: joint_command(1, 2),
+    Clock: Clock(),
+    GoalStatus: GoalStatus(),
+    PoseStamped: goal(3, 0),
+    Goals: goals(goal(3, 0), goal(3, 0)),
+    PathMessage: path((0, 0), (3, 0)),
+    PoseWithCovarianceStamped: placement(3),
+    Odometry: odometry(3, 0, 0),
+}
+"""Messages that every node accepts."""
 
 
 def damaged(chance: random.Random, data: bytes) -> bytes:
@@ -192,16 +186,14 @@ class Attack:
     def run(self, count: int) -> tuple[list[str], str]:
         """Send so many messages; return what broke the promise, and numbers."""
         name = f'{self.input.node} {self.input.topic} ({self.input.kind.__name__})'
-        data = serialize_message(valid(self.input.kind))
+        data = serialize_message(VALID[self.input.kind])
         first = resident(self.pid)
         begun, sent = time.monotonic(), 0
         while sent < count:
             before, sent = sent, sent + self._burst(data)
             if before < count // 10 <= sent:
                 first = resident(self.pid)
-            end = time.monotonic() + PAUSE
-            while time.monotonic() < end:
-                self.harness.executor.spin_once(timeout_sec=PAUSE / 2)
+            spin(self.harness, PAUSE)
             if not self.child.running:
                 return [f'{name}: the node ended: {self.child.stderr[-300:]!r}'], ''
         seconds = time.monotonic() - begun
@@ -246,39 +238,26 @@ class Attack:
     def _works(self) -> None:
         """Send valid messages until the node acts on them."""
         one = self.input
-        wanted: list[tuple[Any, Callable[[], Any]]] = []
         clock = Clock()
-        if one.arguments == SIMULATED:
-            wanted.append((self.publisher, lambda: clock))
+        # A clock may be years ahead.
+        clock.clock.sec = 100
+        wanted = [(self.publisher, clock)] if one.arguments == SIMULATED else []
         if one.node == 'go_to_goal':
-            odometry, goal = valid(Odometry), valid(PoseStamped)
-            odometry.pose.pose.position.x = 0.0
-            wanted += [(self._talk(Odometry, 'odom'), lambda: odometry)]
-            wanted += [(self._talk(PoseStamped, 'goal_pose'), lambda: goal)]
+            wanted.append((self._talk(Odometry, 'odom'), odometry(0, 0, 0)))
+            wanted.append((self._talk(PoseStamped, 'goal_pose'), VALID[PoseStamped]))
         else:
             wheels = one.topic == 'joint_command'
             kind = TwistStamped if one.arguments == STAMPED else JointState if wheels else Twist
-            wanted += [(self._talk(kind, 'joint_command' if wheels else 'cmd_vel'), lambda: valid(kind))]
+            wanted.append((self._talk(kind, 'joint_command' if wheels else 'cmd_vel'), VALID[kind]))
         self.heard.clear()
-        # A clock may be years ahead.
-        seconds = 100
 
         def acts() -> bool:
-            nonlocal seconds
-            seconds += 1
-            clock.clock.sec = seconds
-            for publisher, make in wanted:
-                publisher.publish(make())
-            return bool(self.heard) and acting(self.heard[-1])
+            clock.clock.sec += 1
+            for publisher, message in wanted:
+                publisher.publish(message)
+            return bool(self.heard) and moves(self.heard[-1])
 
         self.harness.until(acts, 'it acts on valid messages')
-
-
-def acting(message: Any) -> bool:
-    if isinstance(message, JointState):
-        return any(message.velocity)
-    twist = message.twist.twist if isinstance(message, Odometry) else message
-    return bool(twist.linear.x or twist.angular.z)
 
 
 def run(count: int, seed: int = 0, inputs: tuple[Input, ...] = INPUTS) -> Outcome:

@@ -23,13 +23,13 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from support.processes import Child, World
+from support.ros_messages import goal, placement
 
-from diffdrive_jacobian.parameters.declaration import default_of, specifications
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
-from process_faults.fuzzed_parameters import NODES, value_of
-from process_faults.hostile import damaged, resident, valid
+from process_faults.fuzzed_parameters import DECLARED, value_of
+from process_faults.hostile import VALID, damaged, resident
 from process_faults.outcome import Outcome
-from process_faults.worlds import quiet_world
+from process_faults.worlds import TEAM, Team, quiet_world, spin
 
 PERIOD = 3.0
 """Mean time between two faults (s)."""
@@ -37,11 +37,6 @@ FIRST = 60.0
 """Time after which the memory counts (s)."""
 MEMORY = 5.0
 """Most that the memory of a process may grow from then on (MB)."""
-ARGUMENTS = {
-    'virtual_robot': ('-p', 'command_interface:=wheels'),
-    'wheel_bridge': (),
-    'go_to_goal': ('-p', 'kp:=6.0', '-p', 'kv:=1.0', '-p', 'linear.x.max_velocity:=1.0'),
-}
 INPUTS = (
     ('cmd_vel', Twist),
     ('joint_command', JointState),
@@ -65,76 +60,33 @@ EXPECTED = (
 """What the processes may log."""
 
 
-class Team:
-    """Three nodes in a namespace."""
+class Attacked(Team):
+    """A team, and publishers and clients of all of its inputs."""
 
     def __init__(self, world: World, space: str) -> None:
-        self.world, self.space, self.harness = world, space, world.harness
+        super().__init__(world, space)
         peer = self.harness.peer
-        self.nodes: dict[str, Child] = {}
         self.ended: list[Child] = []
-        for name in ARGUMENTS:
-            self.start(name)
         self.publishers = {
             topic: peer.create_publisher(kind, f'{space}/{topic}', 20) for topic, kind in INPUTS
         }
-        self.odometry: list[Odometry] = []
-        peer.create_subscription(Odometry, f'{space}/odom', self._on_odometry, 10)
         self.cancel = peer.create_client(Trigger, f'{space}/cancel_goal')
         self.set = {
-            name: peer.create_client(SetParameters, f'{space}/{name}/set_parameters')
-            for name in ARGUMENTS
+            name: peer.create_client(SetParameters, f'{space}/{name}/set_parameters') for name in TEAM
         }
-
-    def _on_odometry(self, message: Odometry) -> None:
-        self.odometry[:] = [message]
-
-    def start(self, name: str) -> None:
-        """Start a node, again if it has ended."""
-        arguments = ('--ros-args', '-r', f'__ns:={self.space}', *ARGUMENTS[name])
-        self.nodes[name] = self.world.start(name, *arguments)
-
-    def send_goal(self, x: float, y: float) -> None:
-        message = PoseStamped()
-        message.pose.position.x, message.pose.position.y, message.pose.orientation.w = x, y, 1.0
-        self.publishers['goal_pose'].publish(message)
 
     def reset(self) -> None:
         """Set all parameters that can change to their defaults, or to those of the command line."""
-        given = {'kp': 6.0, 'kv': 1.0, 'linear.x.max_velocity': 1.0}
-        for name, parameters in NODES.items():
-            messages = []
-            for parameter, (field, specification) in specifications(parameters).items():
-                value = given.get(parameter, default_of(parameters, field))
-                if not specification.read_only:
-                    messages.append(Parameter(parameter, value=value).to_parameter_msg())
+        for name, parameters in DECLARED.items():
+            messages = [
+                Parameter(one, value=TEAM[name].get(one, default)).to_parameter_msg()
+                for one, (specification, default) in parameters.items()
+                if not specification.read_only
+            ]
             # Twice: a limit may be refused while another one is still changed.
             for _ in range(2):
                 future = self.set[name].call_async(SetParameters.Request(parameters=messages))
                 self.harness.until(future.done, f'parameters of {name}')
-
-    def arrives(self) -> bool:
-        """Return whether the robot reaches a goal near to where it is."""
-        self.harness.until(lambda: self.odometry, 'odometry')
-        start = self.odometry[-1].pose.pose.position
-        x, y = start.x + 0.5, start.y + 0.5
-        begun = sent = 0.0
-
-        def there() -> bool:
-            nonlocal sent
-            if time.monotonic() > sent + 8.0:
-                sent = time.monotonic()
-                self.send_goal(x, y)
-            now = self.odometry[-1]
-            at, speed = now.pose.pose.position, now.twist.twist.linear.x
-            return (at.x - x) ** 2 + (at.y - y) ** 2 < 0.03**2 and speed == 0.0
-
-        begun = time.monotonic()
-        while not there():
-            if time.monotonic() > begun + 40.0:
-                return False
-            self.harness.executor.spin_once(timeout_sec=0.01)
-        return True
 
 
 class Soak:
@@ -142,10 +94,8 @@ class Soak:
 
     def __init__(self, world: World, chance: random.Random) -> None:
         self.world, self.chance, self.harness = world, chance, world.harness
-        self.steady, self.other = Team(world, '/steady'), Team(world, '/other')
+        self.steady, self.other = Attacked(world, '/steady'), Attacked(world, '/other')
         self.page = world.start('watch_run', '--no-browser')
-        for child in (*self.steady.nodes.values(), *self.other.nodes.values()):
-            child.until_says('subscribed to')
         self.page.until_says('page: ')
         self.faults = {
             one.__name__.strip('_'): one
@@ -163,22 +113,17 @@ class Soak:
     def memory(self) -> dict[str, float]:
         return {name: resident(child._process.pid) for name, child in self.lasting.items()}
 
-    def spin(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.harness.executor.spin_once(timeout_sec=0.05)
-
     # --- Faults
 
     def _stop(self) -> None:
         team = self.chance.choice((self.steady, self.other))
         child = self.chance.choice([*team.nodes.values(), self.page])
         child.signal(signal.SIGSTOP)
-        self.spin(self.chance.uniform(0.1, 2.5))
+        spin(self.harness, self.chance.uniform(0.1, 2.5))
         child.signal(signal.SIGCONT)
 
     def _restart(self, number: int) -> None:
-        name = self.chance.choice(list(ARGUMENTS))
+        name = self.chance.choice(list(TEAM))
         child = self.other.nodes[name]
         child.signal(number)
         child.exit()
@@ -193,7 +138,7 @@ class Soak:
 
     def _hostile(self) -> None:
         topic, kind = self.chance.choice(INPUTS)
-        data = serialize_message(valid(kind))
+        data = serialize_message(VALID[kind])
         for _ in range(60):
             for _ in range(10):
                 try:
@@ -201,50 +146,46 @@ class Soak:
                 except RCLError:
                     # It is longer than a message of the type can be.
                     continue
-            self.spin(0.005)
+            spin(self.harness, 0.005)
 
     def _flood(self) -> None:
         topic, kind = self.chance.choice(INPUTS)
-        data = serialize_message(valid(kind))
+        data = serialize_message(VALID[kind])
         end = time.monotonic() + 0.5
         while time.monotonic() < end:
             self.steady.publishers[topic].publish(data)
 
     def _parameter(self) -> None:
-        name = self.chance.choice(list(NODES))
-        known = specifications(NODES[name])
-        parameter = self.chance.choice(list(known))
-        field, specification = known[parameter]
-        value = value_of(self.chance, specification, default_of(NODES[name], field))
+        name = self.chance.choice(list(DECLARED))
+        parameter = self.chance.choice(list(DECLARED[name]))
+        value = value_of(self.chance, *DECLARED[name][parameter])
         message = ParameterMessage(name=parameter, value=value)
         client = self.steady.set[name]
         client.remove_pending_request(client.call_async(SetParameters.Request(parameters=[message])))
-        self.spin(1.0)
+        spin(self.harness, 1.0)
         self.steady.reset()
 
     def _goals(self) -> None:
         for team in (self.steady, self.other):
-            team.send_goal(self.chance.uniform(-3, 3), self.chance.uniform(-3, 3))
+            team.goal.publish(goal(self.chance.uniform(-3, 3), self.chance.uniform(-3, 3)))
 
     def _cancel(self) -> None:
         client = self.steady.cancel
         client.remove_pending_request(client.call_async(Trigger.Request()))
 
     def _place(self) -> None:
-        message = PoseWithCovarianceStamped()
-        message.pose.pose.position.x, message.pose.pose.orientation.w = self.chance.uniform(-2, 2), 1.0
-        self.steady.publishers['initialpose'].publish(message)
+        self.steady.publishers['initialpose'].publish(placement(self.chance.uniform(-2, 2)))
 
     def _drive_by_hand(self) -> None:
         end = time.monotonic() + self.chance.uniform(0.1, 1.0)
         while time.monotonic() < end:
-            self.steady.publishers['cmd_vel'].publish(valid(Twist))
-            self.spin(0.05)
+            self.steady.publishers['cmd_vel'].publish(VALID[Twist])
+            spin(self.harness, 0.05)
 
     def _join(self) -> None:
         peer = self.harness.peer
         subscription = peer.create_subscription(Odometry, '/steady/odom', lambda _: None, 10)
-        self.spin(self.chance.uniform(0.1, 1.0))
+        spin(self.harness, self.chance.uniform(0.1, 1.0))
         peer.destroy_subscription(subscription)
 
 
@@ -272,7 +213,7 @@ def run(count: int, seed: int = 0) -> Outcome:
             except AssertionError as error:
                 violations.append(f'{fault}: {error}')
             faults += 1
-            made.spin(chance.uniform(0.5, 1.5) * PERIOD)
+            spin(made.harness, chance.uniform(0.5, 1.5) * PERIOD)
             memory = made.memory()
             if elapsed <= FIRST or not first:
                 first = memory
@@ -286,14 +227,11 @@ def run(count: int, seed: int = 0) -> Outcome:
         grown = {name: most[name] - first[name] for name in first}
         violations += [f'{name}: memory +{by:.1f} MB' for name, by in grown.items() if by > MEMORY]
         for team in (made.steady, made.other):
-            for child in team.nodes.values():
-                child.until_says('subscribed to')
             try:
                 team.reset()
-                if not team.arrives():
-                    violations.append(f'{team.space}: no goal is reached at the end')
+                assert team.arrives(), 'no goal is reached'
             except AssertionError as error:
-                violations.append(f'{team.space}: at the end: {error}')
+                violations.append(f'{team.nodes["go_to_goal"].command}: at the end: {error}')
         children = [*made.lasting.values(), *made.other.nodes.values(), *made.other.ended]
         for child in children:
             violations += [f'{child.command}: {line}' for line in unexpected_lines(child)]

@@ -12,17 +12,11 @@ import signal
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
-from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import PoseStamped, Twist
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
-from support.processes import Child, World
+from support.ros_messages import goal
 
 from process_faults.outcome import Outcome, spread, unexpected
-from process_faults.worlds import quiet_world
+from process_faults.worlds import Team, moves, quiet_world, spin
 
 TIMEOUT = 0.5
 """Timeout of commands and of odometry (s), the default of the nodes."""
@@ -30,87 +24,6 @@ LATE = 0.3
 """How much later than the timeout a zero may be seen here (s). Other processes use the cores, too."""
 HOLD = 2 * TIMEOUT + LATE
 """Shortest time for which a node is gone (s)."""
-ARGUMENTS = {
-    'virtual_robot': ('--ros-args', '-p', 'command_interface:=wheels'),
-    'wheel_bridge': (),
-    'go_to_goal': ('--ros-args', '-p', 'kp:=6.0', '-p', 'kv:=2.0', '-p', 'linear.x.max_velocity:=1.0'),
-}
-
-
-class Team:
-    """Three nodes in processes, and what is heard of them with its time (s)."""
-
-    def __init__(self, world: World) -> None:
-        self.world, self.harness = world, world.harness
-        peer = self.harness.peer
-        self.heard: dict[str, list[tuple[float, Any]]] = {}
-        for topic, kind in (('odom', Odometry), ('cmd_vel', Twist), ('joint_command', JointState)):
-            self._hear(topic, kind)
-        self.statuses = self.harness.listen(GoalStatus, 'goal_status', latched=True)
-        self.goal = peer.create_publisher(PoseStamped, 'goal_pose', 1)
-        self.reset = peer.create_client(Trigger, 'reset_odometry')
-        self.nodes: dict[str, Child] = {}
-        for name in ARGUMENTS:
-            self.start(name)
-        self.harness.until(lambda: self.goal.get_subscription_count(), 'the controller is there')
-
-    def _hear(self, topic: str, kind: Any) -> None:
-        found = self.heard[topic] = []
-        self.harness.peer.create_subscription(
-            kind, topic, lambda message: found.append((when(message), message)), 1000
-        )
-
-    def start(self, name: str) -> None:
-        self.nodes[name] = child = self.world.start(name, *ARGUMENTS[name])
-        child.until_says('subscribed to')
-
-    def drive(self, x: float) -> None:
-        """Send a goal until the robot moves."""
-        message = PoseStamped()
-        message.pose.position.x, message.pose.orientation.w = x, 1.0
-        sent = 0.0
-
-        def drives() -> bool:
-            nonlocal sent
-            if time.monotonic() > sent + 1.0:
-                sent = time.monotonic()
-                self.goal.publish(message)
-            return self.moves()
-
-        self.harness.until(drives, 'the robot drives')
-
-    def moves(self) -> bool:
-        return bool(self.heard['odom']) and moving(self.heard['odom'][-1][1])
-
-    def spin(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        self.harness.until(lambda: time.monotonic() >= end, patience=seconds + 10.0)
-
-    def clear(self) -> None:
-        for one in self.heard.values():
-            del one[:-1]
-
-    def stopped_after(self, topic: str, since: float) -> float:
-        """Return how long after a time the last moving message came (s); negative: there was none."""
-        times = [at for at, message in self.heard[topic] if moving(message) and at > since]
-        return times[-1] - since if times else -1.0
-
-
-def when(message: Any) -> float:
-    """Return the time of a message (s, monotonic): its stamp if it has that of its publication."""
-    if not isinstance(message, Odometry):
-        return time.monotonic()
-    stamp = message.header.stamp
-    return stamp.sec + stamp.nanosec / 1e9 - time.time() + time.monotonic()
-
-
-def moving(message: Any) -> bool:
-    if isinstance(message, JointState):
-        return any(message.velocity)
-    twist = message.twist.twist if isinstance(message, Odometry) else message
-    return bool(twist.linear.x or twist.angular.z)
-
-
 MUST_STOP = {
     'virtual_robot': ('cmd_vel', 'joint_command'),
     'wheel_bridge': ('odom',),
@@ -122,55 +35,43 @@ MUST_STOP = {
 def disturb(team: Team, name: str, kill: bool, chance: random.Random) -> tuple[list[str], list[float]]:
     """Disturb a node while it drives; return what broke the promise, and how soon the others stopped."""
     what = f'{name}, {"SIGKILL" if kill else "SIGSTOP"}'
-    team.drive(200.0)
-    team.spin(chance.uniform(0.0, 0.6))
-    team.clear()
+    drive(team)
+    spin(team.harness, chance.uniform(0.0, 0.6))
     node = team.nodes[name]
     node.signal(signal.SIGKILL if kill else signal.SIGSTOP)
     since = time.monotonic()
-    team.spin(HOLD + chance.uniform(0.3, 1.5))
+    spin(team.harness, HOLD + chance.uniform(0.3, 1.5))
     violations, delays = [], []
     for topic in MUST_STOP[name]:
-        delay = team.stopped_after(topic, since)
-        delays.append(delay)
-        if delay > TIMEOUT + LATE:
-            violations.append(f'{what}: {topic} was not zero for {delay:.2f} s')
-        if moving(team.heard[topic][-1][1]):
+        delays.append(team.moved[topic] - since)
+        if delays[-1] > TIMEOUT + LATE:
+            violations.append(f'{what}: {topic} was not zero for {delays[-1]:.2f} s')
+        if moves(team.last[topic]):
             violations.append(f'{what}: {topic} is not zero at the end')
     if kill:
         node.exit()
         team.start(name)
-        team.harness.until(lambda: team.goal.get_subscription_count() > 0, 'the controller is there')
     else:
         node.signal(signal.SIGCONT)
     if line := next((found for one in team.nodes.values() if (found := unexpected(one.stderr))), ''):
         violations.append(f'{what}: printed {line!r}')
-    x = team.heard['odom'][-1][1].pose.pose.position.x
-    try:
-        team.drive(x + 0.3)
-        arrive(team)
-    except AssertionError as error:
-        violations.append(f'{what}: afterwards the robot does not arrive: {error}')
+    if not team.arrives():
+        violations.append(f'{what}: afterwards the robot does not arrive')
     return violations, delays
 
 
-def arrive(team: Team) -> None:
-    """Wait until the robot has arrived at a goal near to where it is, and stands."""
+def drive(team: Team) -> None:
+    """Send a goal that is far away until the robot moves."""
+    sent = 0.0
 
-    def arrived() -> bool:
-        return bool(team.statuses) and team.statuses[-1].status == GoalStatus.STATUS_SUCCEEDED
+    def drives() -> bool:
+        nonlocal sent
+        if time.monotonic() > sent + 1.0:
+            sent = time.monotonic()
+            team.goal.publish(goal(200, 0))
+        return team.drives()
 
-    begun = time.monotonic()
-    while not arrived():
-        # The robot may have been elsewhere, or the goal lost with a controller.
-        x = team.heard['odom'][-1][1].pose.pose.position.x
-        message = PoseStamped()
-        message.pose.position.x, message.pose.orientation.w = x + 0.2, 1.0
-        team.goal.publish(message)
-        end = time.monotonic() + 4.0
-        team.harness.until(lambda end=end: arrived() or time.monotonic() > end, 'arrival')
-        assert time.monotonic() < begun + 20.0, f'not within 20 s: {team.statuses[-1:]}'
-    team.harness.until(lambda: not team.moves(), 'the robot stands')
+    team.harness.until(drives, 'the robot drives')
 
 
 def run(count: int, seed: int = 0) -> Outcome:
@@ -181,8 +82,8 @@ def run(count: int, seed: int = 0) -> Outcome:
     with tempfile.TemporaryDirectory(prefix='stopped_') as name, quiet_world(Path(name)) as world:
         team = Team(world)
         for index in range(count):
-            node = list(ARGUMENTS)[index % len(ARGUMENTS)]
-            found, measured = disturb(team, node, kill=index // len(ARGUMENTS) % 2 == 0, chance=chance)
+            node = list(MUST_STOP)[index % len(MUST_STOP)]
+            found, measured = disturb(team, node, kill=index // len(MUST_STOP) % 2 == 0, chance=chance)
             violations += found
             print(f'  {index + 1} of {count}: {found}', flush=True)
             delays += [one for one in measured if one >= 0.0]

@@ -1,20 +1,40 @@
-"""Worlds of processes for campaigns, which print nothing and let processes live longer."""
+"""Quiet worlds of long-lived processes for campaigns, and the messages there."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+import time
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from functools import partialmethod
 from io import StringIO
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseStamped, Twist
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState
 from support import processes
 from support.harness import Harness
 from support.processes import Child, World, open_world
+from support.ros_messages import goal
 
 LIFE = 900.0
 """How long a process may live (s)."""
+OUTPUTS = {
+    'virtual_robot': (Odometry, 'odom'),
+    'go_to_goal': (Twist, 'cmd_vel'),
+    'wheel_bridge': (JointState, 'joint_command'),
+}
+"""Type and topic of what each node commands or reports."""
+TEAM = {
+    'virtual_robot': {'command_interface': 'wheels'},
+    'wheel_bridge': {},
+    'go_to_goal': {'kp': 6.0, 'kv': 2.0, 'linear.x.max_velocity': 1.0},
+}
+"""Parameters of the nodes of a `Team`."""
 PATIENCE = 120.0
 """How long a condition may take to come true (s): campaigns run beside other work, at low priority."""
 
@@ -36,3 +56,102 @@ def quiet_world(folder: Path, life: float = LIFE) -> Iterator[World]:
         finally:
             with redirect_stdout(StringIO()):
                 stack.close()
+
+
+def spin(harness: Harness, seconds: float) -> None:
+    """Receive messages for a time (s)."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        harness.executor.spin_once(timeout_sec=0.005)
+
+
+def _twist(message: Any) -> Any:
+    return message.twist.twist if isinstance(message, Odometry) else message
+
+
+def moves(message: Any) -> bool:
+    """Return whether an Odometry, a Twist or a JointState says that the robot moves."""
+    if isinstance(message, JointState):
+        return any(message.velocity)
+    return bool(_twist(message).linear.x or _twist(message).angular.z)
+
+
+def finite(message: Any) -> bool:
+    """Return whether all numbers that a node publishes are finite."""
+    if isinstance(message, JointState):
+        return all(map(math.isfinite, message.velocity))
+    numbers = [_twist(message).linear.x, _twist(message).angular.z]
+    if isinstance(message, Odometry):
+        pose = message.pose.pose
+        numbers += [pose.position.x, pose.position.y, pose.orientation.z, pose.orientation.w]
+        numbers += [*message.pose.covariance, *message.twist.covariance]
+    return all(map(math.isfinite, numbers))
+
+
+class Team:
+    """A robot, a bridge and a controller in processes, and what is heard of them."""
+
+    def __init__(self, world: World, space: str = '', **parameters: object) -> None:
+        """Start the nodes in a namespace, with some parameters besides those of TEAM."""
+        self.world, self.harness = world, world.harness
+        self._space, self._parameters = space, parameters
+        self.last: dict[str, Any] = {}
+        """The last message on each topic."""
+        self.moved: dict[str, float] = {}
+        """When the last message on each topic came that is not zero (s, monotonic)."""
+        self.infinite: list[str] = []
+        """Messages with numbers that are not finite."""
+        for kind, topic in OUTPUTS.values():
+            self._hear(kind, topic)
+        self.statuses = self.harness.listen(GoalStatus, f'{space}/goal_status', latched=True)
+        self.goal = self.harness.peer.create_publisher(PoseStamped, f'{space}/goal_pose', 20)
+        self.nodes: dict[str, Child] = {}
+        for name in TEAM:
+            self.start(name)
+        self.harness.until(self.goal.get_subscription_count, 'the controller is there')
+
+    def _hear(self, kind: Any, topic: str) -> None:
+        def on_message(message: Any) -> None:
+            self.last[topic] = message
+            if moves(message):
+                self.moved[topic] = when(message)
+            if not finite(message):
+                self.infinite.append(str(message)[:300])
+
+        self.harness.peer.create_subscription(kind, f'{self._space}/{topic}', on_message, 1000)
+
+    def start(self, name: str) -> None:
+        """Start a node, again if it has ended."""
+        values = {**TEAM[name], **self._parameters}
+        rules = [word for one, value in values.items() for word in ('-p', f'{one}:={value}')]
+        space = ('-r', f'__ns:={self._space}') if self._space else ()
+        self.nodes[name] = self.world.start(name, '--ros-args', *space, *rules)
+        self.nodes[name].until_says('subscribed to')
+
+    def drives(self) -> bool:
+        """Return whether the robot moves."""
+        return 'odom' in self.last and moves(self.last['odom'])
+
+    def arrives(self, tick: Callable[[], object] | None = None) -> bool:
+        """Send goals near to where the robot is; return whether one is reached, and the robot stands."""
+        tick = tick or (lambda: self.harness.executor.spin_once(timeout_sec=0.01))
+        end, sent, reached = time.monotonic() + 40.0, -math.inf, False
+        while not reached or self.drives():
+            if time.monotonic() > end:
+                return False
+            if not reached and time.monotonic() > sent + 8.0 and 'odom' in self.last:
+                # The robot may have been elsewhere, or the goal lost with a controller.
+                sent, at = time.monotonic(), self.last['odom'].pose.pose.position
+                self.statuses.clear()
+                self.goal.publish(goal(at.x + 0.3, at.y + 0.4))
+            tick()
+            reached = any(one.status == GoalStatus.STATUS_SUCCEEDED for one in self.statuses)
+        return True
+
+
+def when(message: Any) -> float:
+    """Return the time of a message (s, monotonic): its stamp if it has that of its publication."""
+    if not isinstance(message, Odometry):
+        return time.monotonic()
+    stamp = message.header.stamp
+    return stamp.sec + stamp.nanosec / 1e9 - time.time() + time.monotonic()

@@ -25,8 +25,8 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.remote_goal import _Session
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.parameters import configurations as configuration_files
-from diffdrive_jacobian.parameters.configurations import configurations
+from diffdrive_jacobian.parameters import file as configuration_files
+from diffdrive_jacobian.parameters.file import configurations
 from diffdrive_jacobian.recording import NothingToPlayError, Playback, replay
 from diffdrive_jacobian.recording.record import open_recording
 from diffdrive_jacobian.ros.runner import ros_context, running
