@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sqlite3
+import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -12,22 +13,31 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
-from rosbags.rosbag2 import CompressionFormat, CompressionMode
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2.metadata import dump_qos_v9
+from rosbags.rosbag2.storage_mcap import McapWriter
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from ruamel.yaml import YAML
 
-from diffdrive_jacobian.bags.bag_reader import BagError, DamagedBagError, messages, open_bag
+from diffdrive_jacobian.bags import mcap
+from diffdrive_jacobian.bags.bag_reader import ROOT, BagError, DamagedBagError, messages, open_bag
+from diffdrive_jacobian.bags.bounded_reader import MAX_MESSAGE
 from diffdrive_jacobian.bags.files import REPLACED, is_journal, scratch_directory, scratch_prefix
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
-from diffdrive_jacobian.bags.limits import MAX_MESSAGE
-from diffdrive_jacobian.bags.metadata import ROOT
-from diffdrive_jacobian.bags.storage import STORAGES as STORAGES
-from diffdrive_jacobian.bags.storage import BagWriter
 from diffdrive_jacobian.bounded_yaml import MAX_SIZE
 from diffdrive_jacobian.text import format_size, printable
 
+if TYPE_CHECKING:
+    from rosbags.rosbag2.writer import StorageWriter
+
+STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+_CHUNK_CHECKSUM = 9 + 3 * 8
+"""Place of the checksum in the record of a chunk, after opcode, length, times and size."""
+_DATA_END = 9 + 4
+"""Size of the record that ends the data section and has its checksum."""
 MAX_SQLITE_PATH = 504
 """Length of the longest resolved path that SQLite opens (bytes)."""
 BAG_SUFFIXES = ('.mcap', '.db3', '.zstd', '.db3-shm', '.db3-wal', '.db3-journal')
@@ -37,6 +47,70 @@ REMAINDER = 10_000
 ESCAPED = 20
 """Length in YAML of a character, with its share of indentation, at most."""
 _SUM = (1 << 64) - 1
+
+
+class CheckedMcapWriter(McapWriter):
+    """rosbags' writer, with checksums of chunks, data section and summary (mcap.dev/spec)."""
+
+    def close_chunk(self) -> None:
+        """Write the pending chunk."""
+        place = self.bio.tell() + _CHUNK_CHECKSUM
+        checksum = zlib.crc32(self.chunk.bio.getbuffer())
+        super().close_chunk()
+        end = self.bio.tell()
+        self.bio.seek(place)
+        self.bio.write(struct.pack('<I', checksum))
+        self.bio.seek(end)
+
+    def close(self, version: int, metadata: str) -> None:
+        """Write the last chunk, the metadata and the summary, and close the file."""
+        super().close(version, metadata)
+        with open(self.path, 'r+b') as file:
+            footer = file.seek(-mcap.FOOTER_END.size, 2)
+            summary, *_ = mcap.FOOTER_END.unpack(file.read())
+            self._write_checksum(file, 0, summary - _DATA_END, summary - 4)
+            self._write_checksum(file, summary, footer + 16, footer + 16)
+
+    @staticmethod
+    def _write_checksum(file: BinaryIO, start: int, end: int, place: int) -> None:
+        checksum = mcap.file_checksum(file, start, end)
+        file.seek(place)
+        file.write(struct.pack('<I', checksum))
+
+
+class PathSqlite3Writer(Sqlite3Writer):
+    """rosbags' writer, which opens its file by the path and not by a URI."""
+
+    def __init__(self, path: Path, compression: CompressionMode) -> None:
+        """Create the file, named after the directory.
+
+        Args:
+            path: The bag's directory.
+            compression: Not supported by SQLite files.
+        """
+        if compression == CompressionMode.STORAGE:
+            raise ValueError('SQLite files cannot be compressed as a whole while they are written')
+        self.path = path.absolute() / f'{path.name}.db3'
+        self.conn = sqlite3.connect(self.path)
+        try:
+            # A bag gets its name after its files were synced. Until then it need not survive
+            # a power cut.
+            self.conn.execute('PRAGMA synchronous = OFF')
+            self.conn.execute('PRAGMA journal_mode = MEMORY')
+            self.conn.executescript(self.SQLITE_SCHEMA)
+        except BaseException:
+            self.conn.close()  # Nobody else can: there is no writer yet.
+            raise
+        self.cursor = self.conn.cursor()
+
+
+class BagWriter(Writer):
+    """Writes a bag to any path."""
+
+    STORAGE_PLUGINS: Mapping[StoragePlugin, type[StorageWriter]] = {
+        StoragePlugin.MCAP: CheckedMcapWriter,
+        StoragePlugin.SQLITE3: PathSqlite3Writer,
+    }
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -15,9 +15,17 @@ from typing import Any
 
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import ReaderError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
+from diffdrive_jacobian.bags.bag_reader import MetadataError, parse_parameters
 from diffdrive_jacobian.bags.bag_writer import STORAGES
-from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
+from diffdrive_jacobian.bags.bounded_reader import (
+    UNPACK_ERRORS,
+    Budget,
+    parse_bounded_qos,
+    unpack_file,
+    unpack_message,
+)
 from diffdrive_jacobian.bags.files import (
     ZSTD,
     NotABagError,
@@ -33,14 +41,79 @@ from diffdrive_jacobian.bags.journal import (
     Record,
     Text,
 )
-from diffdrive_jacobian.bags.limits import UNPACK_ERRORS, Budget, unpack_file, unpack_message
-from diffdrive_jacobian.bags.message_definitions import UnknownTypeError
-from diffdrive_jacobian.bags.metadata import MetadataError, parse_parameters
-from diffdrive_jacobian.bags.salvage_mcap import Topic, read_mcap
-from diffdrive_jacobian.bags.salvage_sqlite import read_sqlite
-from diffdrive_jacobian.bags.topic_types import definition_and_hash
+from diffdrive_jacobian.bags.message_definitions import (
+    Definition,
+    UnknownTypeError,
+    definition,
+    known_definition,
+)
+from diffdrive_jacobian.bags.salvage import Topic, read_mcap, read_sqlite
 from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
 from diffdrive_jacobian.text import printable
+
+MAX_DEFINITION = 200_000
+"""Length of the longest definition of a type that is parsed; those of ROS have less than a tenth."""
+_PARSE_ERRORS = (TypesysError, LookupError, ValueError, AssertionError, RecursionError)
+
+
+def definition_and_hash(topic: Topic) -> tuple[str, str]:
+    """Return the definition of a topic's type, and the definition's hash (RIHS01).
+
+    Raises:
+        UnknownTypeError: The file lacks one of them, and the type is not known.
+    """
+    try:
+        known = _known(topic.type_name)
+        if topic.type_hash == known.type_hash:
+            # The text in the file may be damaged, or differ in comments.
+            return known.text, known.type_hash
+        if topic.definition and topic.type_hash:
+            return topic.definition, topic.type_hash
+        if topic.definition in ('', known.text) and topic.type_hash in ('', known.type_hash):
+            return known.text, known.type_hash
+        reason = f'{topic.type_name} is installed in another version than it was recorded'
+    except UnknownTypeError as error:
+        if topic.definition and topic.type_hash:
+            return topic.definition, topic.type_hash
+        reason = str(error)
+    if not topic.definition:
+        raise UnknownTypeError(reason)
+    if len(topic.definition) > MAX_DEFINITION:
+        raise UnknownTypeError(
+            f'{reason}, and its definition has {len(topic.definition)} characters; at most '
+            f'{MAX_DEFINITION} are parsed'
+        )
+    try:
+        return topic.definition, _hash(topic.definition, topic.type_name)
+    except _PARSE_ERRORS as error:
+        raise UnknownTypeError(reason) from error
+
+
+def _known(type_name: str) -> Definition:
+    """Return the definition of an installed type, or of one that is known without ROS.
+
+    Raises:
+        UnknownTypeError: It is neither.
+    """
+    try:
+        return definition(type_name)
+    except UnknownTypeError:
+        try:
+            return known_definition(type_name)
+        except UnknownTypeError:
+            pass
+        raise
+
+
+def _hash(text: str, type_name: str) -> str:
+    """Return the hash of a definition.
+
+    It is only parsed. rosbags' `register` would generate code from it and execute that.
+    """
+    store = get_typestore(Stores.EMPTY)
+    store.fielddefs.update(get_types_from_msg(text, type_name))
+    return store.hash_rihs01(type_name)
+
 
 READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'

@@ -22,8 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.run import Run, Series
-from diffdrive_jacobian.bags.run_reader import BagError, ReadingInterruptedError
+from diffdrive_jacobian.bags.run import BagError, ReadingInterruptedError, Run, Series
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
 from diffdrive_jacobian.numerics.elementary import wrap

@@ -13,8 +13,15 @@ from diffdrive_jacobian.diagnosis.description import (
     Stream,
 )
 from diffdrive_jacobian.messages.names import base_name
-from diffdrive_jacobian.messages.topic_faults import ALTERNATING, SEVERAL, UNPUBLISHED, UNREAD
-from diffdrive_jacobian.messages.topics import CLOCK, TOPICS, Topic
+from diffdrive_jacobian.messages.topics import (
+    ALTERNATING,
+    CLOCK,
+    SEVERAL,
+    TOPICS,
+    UNPUBLISHED,
+    UNREAD,
+    Topic,
+)
 from diffdrive_jacobian.text import listed
 
 _UNKNOWN = Topic(name='')

@@ -10,14 +10,16 @@ from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
 
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.messages.fields import is_identifier, plain, walk
 from diffdrive_jacobian.messages.structure import (
     Array,
     FieldType,
     Number,
     Sequence,
     Structure,
+    is_identifier,
+    plain,
     structure,
+    walk,
 )
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import wrap_publish

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.control import Arrival, Path
 from diffdrive_jacobian.control.path_progress import PathProgress
 from diffdrive_jacobian.live.quantities import rounded
-from diffdrive_jacobian.messages.goal_follower import (
+from diffdrive_jacobian.messages.goal_status import (
     UNSTAMPED,
     Fate,
     FollowedGoal,
     GoalFollower,
+    GoalState,
     Stamp,
 )
-from diffdrive_jacobian.messages.goal_status import GoalState
 
 Goals = NDArray[np.float64]
 """`[x, y, theta]` of each, shape (n, 3) (m, m, rad)."""

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.bag_reader import BagError, open_bag
-from diffdrive_jacobian.bags.run import Run, Series
-from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.run import Run, Series, read_run
 from diffdrive_jacobian.bags.timeline import Timeline, seconds, timeline
-from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.covariances import from_covariance
+from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
 from diffdrive_jacobian.messages.names import base_name, namespace_of
 from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.time_units import NANOSECONDS

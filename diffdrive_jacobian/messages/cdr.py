@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.fields import check_readable, field_value
 from diffdrive_jacobian.messages.structure import (
     BIG_ENDIAN,
     COUNT,
@@ -37,6 +36,8 @@ from diffdrive_jacobian.messages.structure import (
     Structure,
     Text,
     check_plain,
+    check_readable,
+    field_value,
     least_size,
     structure,
     uniform_size,

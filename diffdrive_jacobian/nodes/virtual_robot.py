@@ -38,9 +38,8 @@ from diffdrive_jacobian.messages.codecs import (
     Place,
     Wheels,
 )
-from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.covariances import from_covariance
-from diffdrive_jacobian.messages.topic_faults import GOALS_LOST, SEVERAL, UNPUBLISHED
+from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
+from diffdrive_jacobian.messages.topics import GOALS_LOST, SEVERAL, UNPUBLISHED
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.nodes.robot_defects import RobotDefects
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters

@@ -18,8 +18,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diffdrive_jacobian.bags.run import Run
-from diffdrive_jacobian.bags.time_series import commanded, limits, line, measured
-from diffdrive_jacobian.bags.timeline import Array, Timeline, jumps, timeline, tolerance
+from diffdrive_jacobian.bags.timeline import (
+    Array,
+    Timeline,
+    commanded,
+    jumps,
+    limits,
+    line,
+    measured,
+    timeline,
+    tolerance,
+)
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.plots.fault_marks import ViolationMark, mark_faults
 from diffdrive_jacobian.plots.output_files import FORMATS, create

@@ -11,8 +11,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.messages.goal_follower import FollowedGoal, GoalFollower
-from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.messages.goal_status import FollowedGoal, GoalFollower, GoalState
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.properties._messages import Pose, Twist

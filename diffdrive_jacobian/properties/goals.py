@@ -12,8 +12,7 @@ from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, Status
-from diffdrive_jacobian.messages.goal_follower import UNSTAMPED, Stamp
-from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.messages.goal_status import UNSTAMPED, GoalState, Stamp
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name, Names
 from diffdrive_jacobian.properties._messages import (

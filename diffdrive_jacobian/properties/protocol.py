@@ -10,8 +10,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.messages.goal_follower import Stamp
-from diffdrive_jacobian.messages.goal_status import FOLLOWING, GoalState
+from diffdrive_jacobian.messages.goal_status import FOLLOWING, GoalState, Stamp
 from diffdrive_jacobian.numerics.fields import Name, Names
 from diffdrive_jacobian.properties._messages import FieldReader
 from diffdrive_jacobian.properties.base import Property, Watch

@@ -14,10 +14,9 @@ from rclpy.node import Node
 
 from diffdrive_jacobian.bags.bag_writer import Summary
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.messages.topics import OF_EVERY_NODE
+from diffdrive_jacobian.messages.topics import OF_EVERY_NODE, Selection
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
-from diffdrive_jacobian.recording.selection import Selection
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.signals import Signals

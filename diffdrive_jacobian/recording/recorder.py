@@ -19,6 +19,7 @@ from rosbags.interfaces import Qos
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Record, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.messages.names import full_name
+from diffdrive_jacobian.messages.topics import Selection as Selection
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 from diffdrive_jacobian.recording.reception import (
@@ -27,7 +28,6 @@ from diffdrive_jacobian.recording.reception import (
     Intake,
     Reception,
 )
-from diffdrive_jacobian.recording.selection import Selection as Selection
 from diffdrive_jacobian.ros.qos import to_rosbags
 from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage, reason
 from diffdrive_jacobian.text import printable

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
@@ -19,22 +20,131 @@ from diffdrive_jacobian.bags.bag_writer import (
     check_target,
     describe_too_large,
 )
+from diffdrive_jacobian.bags.bounded_reader import MAX_MESSAGE
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import (
     LEFT_OUT,
     LOST,
+    OVERHEAD,
     Channel,
     JournalWriter,
     Message,
     Record,
     Text,
 )
-from diffdrive_jacobian.bags.limits import MAX_MESSAGE
-from diffdrive_jacobian.bags.salvage_mcap import Topic, read_mcap
+from diffdrive_jacobian.bags.salvage import Topic, read_mcap
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.plots.output_files import names_by_time
-from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
 from diffdrive_jacobian.text import printable
+
+FLUSH_PERIOD = 0.1
+"""Period at which records are handed to the operating system (s)."""
+SYNC_PERIOD = 0.3
+"""Period at which they are synced to the disk (s)."""
+CAPACITY = 128 << 20
+"""Memory for records that wait to be written (bytes): four seconds of 1 MB at 30 Hz."""
+EARLY = 4 << 20
+"""Waiting records of this size are written before the period is over (bytes)."""
+
+
+class JournalGoneError(DiffdriveError, OSError):
+    """The journal was removed, renamed or replaced while it was being written."""
+
+
+class JournalThread:
+    """Writes records to a journal in a thread. Until they are written they wait in bounded memory."""
+
+    def __init__(
+        self,
+        journal: JournalWriter,
+        *,
+        capacity: int = CAPACITY,
+        lossless: bool = False,
+        before_sync: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Start the thread.
+
+        Args:
+            journal: Where the records are written.
+            capacity: Memory for records that wait to be written (bytes).
+            lossless: Whether `add` waits when that is used up. Otherwise it drops messages.
+            before_sync: Called in the thread before each sync.
+        """
+        self._journal = journal
+        self._capacity = capacity
+        self._lossless = lossless
+        self._before_sync = before_sync
+        self._changed = threading.Condition()
+        self._closing = False
+        self.error: OSError | None = None
+        """Why nothing more can be written. None: no error."""
+        # A daemon: an exception in the main thread must be able to end the process.
+        self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
+        self._thread.start()
+
+    def add(self, record: Record) -> bool:
+        """Queue a record.
+
+        Returns:
+            Whether it was queued. False: the queue is full, or writing has failed. Only messages are
+            dropped because the queue is full.
+        """
+        if isinstance(record, Message) and not self._has_room(len(record.data) + OVERHEAD):
+            return False
+        if self._closing or self.error is not None:
+            return False
+        before = self._journal.waiting
+        self._journal.add(record)
+        if before < EARLY <= self._journal.waiting:
+            with self._changed:
+                self._changed.notify_all()
+        return True
+
+    def close(self) -> None:
+        """Write all queued records, however long the disk takes, and end the thread."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join()
+
+    def _has_room(self, size: int) -> bool:
+        def room() -> bool:
+            waiting = self._journal.waiting
+            # A message larger than the capacity is accepted when nothing else waits.
+            return waiting == 0 or waiting + size <= self._capacity or self.error is not None
+
+        if self._lossless and not room():
+            with self._changed:
+                self._changed.wait_for(room)
+        return room()
+
+    def _run(self) -> None:
+        synced = time.monotonic()
+        while self.error is None:
+            with self._changed:
+                if not self._closing and self._journal.waiting < EARLY:
+                    self._changed.wait(FLUSH_PERIOD)
+                closing = self._closing
+            try:
+                if closing or time.monotonic() - synced >= SYNC_PERIOD:
+                    self._before_sync()
+                    self._journal.flush()
+                    self._journal.sync()
+                    self._check()
+                    synced = time.monotonic()
+                else:
+                    self._journal.flush()
+            except OSError as error:
+                self.error = error
+            with self._changed:
+                self._changed.notify_all()
+            if closing:
+                return
+
+    def _check(self) -> None:
+        if not self._journal.in_place():
+            raise JournalGoneError(f'{self._journal.path} was removed, renamed or replaced')
+
 
 MAX_REASON = 500
 """Largest length of the report on a topic that was left out (characters)."""

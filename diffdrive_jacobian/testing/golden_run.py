@@ -19,8 +19,16 @@ from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Channel, Message, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.messages.fields import is_identifier, plain, walk
-from diffdrive_jacobian.messages.structure import COUNT, Array, FieldType, Sequence, structure
+from diffdrive_jacobian.messages.structure import (
+    COUNT,
+    Array,
+    FieldType,
+    Sequence,
+    is_identifier,
+    plain,
+    structure,
+    walk,
+)
 from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TRANSFORMS
 from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.testing.recorded_run import RecordedRun

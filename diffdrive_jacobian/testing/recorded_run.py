@@ -9,10 +9,10 @@ from pathlib import Path
 from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.messages.topics import Selection
 from diffdrive_jacobian.plots.run_figure import draw
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
-from diffdrive_jacobian.recording.selection import Selection
 
 BAG = 'run'
 """Name of the bag in the directory of a test."""

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.recording.selection import RUN_TOPICS, Selection
+from diffdrive_jacobian.messages.topics import RUN_TOPICS, Selection
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli, _options

@@ -12,7 +12,7 @@ from support.bags import SECOND, write_bag
 from support.ros_messages import goal, joint_command, odometry
 
 import diffdrive_jacobian
-from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.run import read_run
 from diffdrive_jacobian.plots.run_table import write_csv
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.sweep_gains import main as sweep_gains

@@ -23,14 +23,17 @@ from support.raw_bags import PLUGINS, data_file, run_tool
 from support.ros_messages import goal, joint_command, twist_stamped
 
 from diffdrive_jacobian.bags import BagError, NothingToSaveError, read_run, recover
-from diffdrive_jacobian.bags.bag_reader import find_damage
+from diffdrive_jacobian.bags.bag_reader import (
+    MetadataError,
+    check_connections,
+    check_metadata,
+    find_damage,
+)
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.bags.metadata import MetadataError, check_connections, check_metadata
-from diffdrive_jacobian.bags.time_series import commanded, limits, measured
-from diffdrive_jacobian.bags.timeline import timeline
+from diffdrive_jacobian.bags.timeline import commanded, limits, measured, timeline
 from diffdrive_jacobian.plots.run_figure import LABELS, draw
 from diffdrive_jacobian.tools import plot_run, recover_run, replay_run
 

@@ -14,6 +14,7 @@ from support.bags import SECOND, odom, write_bag
 
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.bag_writer import build_bag
+from diffdrive_jacobian.bags.damaged_bag import definition_and_hash
 from diffdrive_jacobian.bags.journal import Channel, Message
 from diffdrive_jacobian.bags.message_definitions import (
     UnknownTypeError,
@@ -23,8 +24,7 @@ from diffdrive_jacobian.bags.message_definitions import (
     message_class,
     recorded_definition_differs,
 )
-from diffdrive_jacobian.bags.salvage_mcap import Topic
-from diffdrive_jacobian.bags.topic_types import definition_and_hash
+from diffdrive_jacobian.bags.salvage import Topic
 from diffdrive_jacobian.messages.topics import TOPICS
 
 TYPES = sorted({kind for topic in TOPICS.values() for kind in topic.types})

@@ -25,9 +25,8 @@ from diffdrive_jacobian.bags import NotABagError, NothingToSaveError, mcap, reco
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.bags.run_reader import BagError, read_run
-from diffdrive_jacobian.bags.time_series import commanded, limits, measured
-from diffdrive_jacobian.bags.timeline import timeline
+from diffdrive_jacobian.bags.run import BagError, read_run
+from diffdrive_jacobian.bags.timeline import commanded, limits, measured, timeline
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.plots.run_figure import LABELS

@@ -16,7 +16,7 @@ from diffdrive_jacobian.bags import journal, mcap
 from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
-from diffdrive_jacobian.bags.salvage_mcap import Topic, read_mcap
+from diffdrive_jacobian.bags.salvage import Topic, read_mcap
 
 pytestmark = pytest.mark.usefixtures('quick_disk')
 

@@ -31,7 +31,7 @@ from diffdrive_jacobian.bags.bag_reader import ReadingInterruptedError
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Channel, Message
 from diffdrive_jacobian.bags.message_definitions import definition, known_structure
-from diffdrive_jacobian.bags.run_reader import BagError, read_run
+from diffdrive_jacobian.bags.run import BagError, read_run
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import GOALS

@@ -35,7 +35,7 @@ from support.raw_bags import (
     write_journal,
 )
 
-from diffdrive_jacobian.bags import limits
+from diffdrive_jacobian.bags import bounded_reader
 from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.message_definitions import definition
@@ -217,7 +217,7 @@ def test_a_length_beyond_all_positions(run, capsys):
 
 
 @pytest.mark.parametrize(
-    ('name', 'compress'), [('lz4', lz4.frame.compress), ('zstd', limits.zstd.compress)]
+    ('name', 'compress'), [('lz4', lz4.frame.compress), ('zstd', bounded_reader.zstd.compress)]
 )
 def test_cuts_in_a_compressed_chunk(run, tmp_path, capsys, name, compress):
     """As rosbag2 writes chunks: what comes before the cut can be unpacked, as far as whole blocks go."""

@@ -11,7 +11,7 @@ from support.lockstep_nodes import make_complete
 from support.recorded import recorded
 from support.ros_messages import twist
 
-from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.run import read_run
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.calibration import PARAMETERS, Geometry, calibrate
 from diffdrive_jacobian.calibration.data import read_wheels_and_reference

@@ -14,7 +14,6 @@ from nav_msgs.msg import Goals, Odometry
 from unique_identifier_msgs.msg import UUID
 
 from diffdrive_jacobian.bags.message_definitions import definition, is_known, known_definition
-from diffdrive_jacobian.messages.fields import is_identifier, is_stamp, walk
 from diffdrive_jacobian.messages.structure import (
     Array,
     DefinitionError,
@@ -23,7 +22,10 @@ from diffdrive_jacobian.messages.structure import (
     Structure,
     Text,
     defined,
+    is_identifier,
+    is_stamp,
     structure,
+    walk,
 )
 
 

@@ -15,7 +15,7 @@ from support.processes import Drive, open_world
 from support.ros_messages import goal, odometry, path, receive
 from support.runs import STRAIGHT, run_of
 
-from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.run import read_run
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.control import Path, circle_path, line_path, planned_path
 from diffdrive_jacobian.drives import drive, in_lockstep

@@ -19,7 +19,7 @@ from ruamel.yaml import YAML
 from support.raw_bags import read_journal
 
 from diffdrive_jacobian import bounded_yaml
-from diffdrive_jacobian.bags import bag_reader, bounded_reader, journal, limits, recover
+from diffdrive_jacobian.bags import bag_reader, bounded_reader, journal, recover
 from diffdrive_jacobian.bags import bag_writer as building
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.bags.files import journal_of
@@ -32,8 +32,13 @@ from diffdrive_jacobian.bags.journal import (
 )
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.recording import recording as recordings
-from diffdrive_jacobian.recording.journal_thread import JournalThread
-from diffdrive_jacobian.recording.recording import LOST, MAX_LEFT_OUT, Recording, RecordingError
+from diffdrive_jacobian.recording.recording import (
+    LOST,
+    MAX_LEFT_OUT,
+    JournalThread,
+    Recording,
+    RecordingError,
+)
 
 pytestmark = pytest.mark.usefixtures('quick_disk')
 
@@ -437,8 +442,7 @@ def test_custom_data_that_readers_would_refuse_stays_in_the_journal(tmp_path, mo
 
 @pytest.mark.parametrize('storage', STORAGES)
 def test_a_message_that_readers_would_refuse_stays_in_the_journal(tmp_path, monkeypatch, storage):
-    for module in (bounded_reader, limits):
-        monkeypatch.setattr(module, 'MAX_RECORD', 5_000_000)
+    monkeypatch.setattr(bounded_reader, 'MAX_RECORD', 5_000_000)
     for module in (building, recordings):
         monkeypatch.setattr(module, 'MAX_MESSAGE', 3_000_000)
     monkeypatch.setattr(journal, 'BLOCK', 1_000_000)

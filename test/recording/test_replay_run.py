@@ -23,7 +23,7 @@ from support.ros_messages import goal, goals, twists
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.recording.replayer import Replayer
+from diffdrive_jacobian.recording.replaying import Replayer
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.tools import replay_run
