@@ -9,14 +9,14 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
 from math import inf
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from rosbags.interfaces import Qos
 
-from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Record, Text
+from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.messages.topics import Selection as Selection
@@ -26,11 +26,13 @@ from diffdrive_jacobian.recording.reception import (
     CallbackReception,
     CountingReception,
     Intake,
-    Reception,
 )
 from diffdrive_jacobian.ros.qos import to_rosbags
 from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage, reason
 from diffdrive_jacobian.text import printable
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.recording.recording import Recording
 
 DEPTH = 4000
 """Depth of the queue of each subscription."""
@@ -57,26 +59,13 @@ MAX_REPORT = 500
 """Largest length of the report on a topic (characters)."""
 
 
-class Sink(Protocol):
-    """The recording of a recorder."""
-
-    def add(self, record: Record) -> None:
-        """Add a record."""
-
-    def set_missed(self, topic: str, messages: int) -> None:
-        """Set the number of messages of a topic that are known to be missed so far."""
-
-    def set_left_out(self, topic: str, why: str) -> None:
-        """Note that a topic, or its publishers of one type, are not recorded."""
-
-
 class Recorder(Node):  # type: ignore[misc]
     """Records the selected topics, each from the time at which its first publisher is discovered."""
 
     def __init__(
         self,
         selection: Selection,
-        sink: Sink,
+        sink: Recording,
         *,
         with_info: bool = False,
         now: Callable[[], int] | None = None,
@@ -104,7 +93,7 @@ class Recorder(Node):  # type: ignore[misc]
         self._names = {self._resolved(topic) for topic in selection.topics}
         self._pattern = re.compile(selection.pattern) if selection.pattern else None
         self._channels: dict[str, Channel] = {}
-        self._receptions: dict[str, Reception] = {}
+        self._receptions: dict[str, CallbackReception | CountingReception] = {}
         self._intake = Intake(self) if with_info else None
         self._refused: set[str] = set()
         self._queries: dict[str, ParameterQuery] = {}
@@ -146,8 +135,8 @@ class Recorder(Node):  # type: ignore[misc]
             if topic not in self._channels:
                 self._subscribe(topic, publishers)
             else:
-                self._note_profiles(self._channels[topic], publishers)
-                self._note_types(self._channels[topic], publishers)
+                self._note_changes(self._channels[topic], publishers)
+            if topic in self._channels:
                 self._match(self._channels[topic], publishers)
             for publisher in publishers:
                 self._ask_for_parameters(publisher.node_namespace, publisher.node_name)
@@ -168,9 +157,7 @@ class Recorder(Node):  # type: ignore[misc]
         self.awaited = self._unconfirmed()
 
     def drained(self) -> bool:
-        """Return whether all messages sent before `end` were received, as far as can be determined.
-
-        Or the time for them is over: `give_up` is then called.
+        """Return whether all messages sent before `end` were received, or the time for them is over.
 
         A reliable publisher has delivered all if a message arrives that it sent after the end. Otherwise
         a message may be missing after a burst, which may have exceeded the buffer: the publisher then
@@ -190,7 +177,8 @@ class Recorder(Node):  # type: ignore[misc]
         in_doubt = self.awaited and now - self._last_burst < HEARTBEAT
         if now - self._last_added > IN_TRANSIT and not in_doubt:
             for topic in self._unconfirmed(self._large):
-                self._leave_end_out(topic, 'its last messages are large, and cannot be confirmed')
+                why = 'its last messages are large, and cannot be confirmed'
+                self._sink.set_left_out(f'possibly the end of {topic}', why)
             return True
         if now > self._drain_deadline:
             self.give_up(f'messages were still arriving {DRAIN_PATIENCE:.0f} s after the end')
@@ -200,10 +188,7 @@ class Recorder(Node):  # type: ignore[misc]
     def give_up(self, why: str) -> None:
         """Report that messages sent before `end` may be missing, because it was not waited for them."""
         for topic in self._unconfirmed() or self.topics:
-            self._leave_end_out(topic, why)
-
-    def _leave_end_out(self, topic: str, why: str) -> None:
-        self._sink.set_left_out(f'possibly the end of {topic}', why)
+            self._sink.set_left_out(f'possibly the end of {topic}', why)
 
     def _unconfirmed(self, among: Collection[bytes] | None = None) -> list[str]:
         """Return the topics with a reliable publisher, among these or all, of which more may come."""
@@ -236,8 +221,7 @@ class Recorder(Node):  # type: ignore[misc]
     def _wants(self, topic: str) -> bool:
         if topic in self._names:
             return True
-        hidden = any(part.startswith('_') for part in topic.split('/'))
-        if self._everything and not hidden:
+        if self._everything and '/_' not in topic:
             return True
         return self._pattern is not None and self._pattern.search(topic) is not None
 
@@ -261,9 +245,15 @@ class Recorder(Node):  # type: ignore[misc]
             qos=_profiles(publishers),
         )
         self._channels[topic] = channel
-        self._receptions[topic] = self._reception(channel, message)
+        if self._intake is None:
+            on_data = partial(self._on_data, channel.id)
+            self._receptions[topic] = CallbackReception(self, message, topic, DEPTH, on_data)
+        else:
+            on_message = partial(self._on_message, channel.id)
+            self._receptions[topic] = CountingReception(
+                self, message, topic, DEPTH, self._intake, on_message, self._is_late
+            )
         self._sink.add(channel)
-        self._match(channel, publishers)
 
     def _match(self, channel: Channel, publishers: list[Any]) -> None:
         try:
@@ -273,15 +263,6 @@ class Recorder(Node):  # type: ignore[misc]
         except (RuntimeError, NameValidationException) as error:
             self._leave_out(channel.topic, reason(error))
 
-    def _reception(self, channel: Channel, message: type) -> Reception:
-        if self._intake is None:
-            on_data = partial(self._on_data, channel.id)
-            return CallbackReception(self, message, channel.topic, DEPTH, on_data)
-        on_message = partial(self._on_message, channel.id)
-        return CountingReception(
-            self, message, channel.topic, DEPTH, self._intake, on_message, self._is_late
-        )
-
     def _leave_out(self, topic: str, why: str) -> None:
         """Report once that a topic, or its publishers of one type, are not recorded."""
         self._refused.add(topic)
@@ -289,15 +270,12 @@ class Recorder(Node):  # type: ignore[misc]
         # Other processes choose the names.
         self.get_logger().error(printable(f'{topic} is not recorded: {why}', MAX_REPORT))
 
-    def _note_profiles(self, channel: Channel, publishers: list[Any]) -> None:
-        profiles = _profiles(publishers)
-        new = tuple(one for one in profiles if one not in channel.qos)
-        if new:
+    def _note_changes(self, channel: Channel, publishers: list[Any]) -> None:
+        """Note new profiles and types of the publishers."""
+        if new := tuple(one for one in _profiles(publishers) if one not in channel.qos):
             channel = replace(channel, qos=channel.qos + new)
             self._channels[channel.topic] = channel
             self._sink.add(channel)
-
-    def _note_types(self, channel: Channel, publishers: list[Any]) -> None:
         for other in {one.topic_type for one in publishers} - {channel.type_name}:
             if (mismatch := f'{channel.topic} of {other}') not in self._refused:
                 self._leave_out(mismatch, f'{channel.topic} is recorded as {channel.type_name}')

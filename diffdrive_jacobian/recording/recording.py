@@ -47,10 +47,6 @@ EARLY = 4 << 20
 """Waiting records of this size are written before the period is over (bytes)."""
 
 
-class JournalGoneError(DiffdriveError, OSError):
-    """The journal was removed, renamed or replaced while it was being written."""
-
-
 class JournalThread:
     """Writes records to a journal in a thread. Until they are written they wait in bounded memory."""
 
@@ -86,8 +82,8 @@ class JournalThread:
         """Queue a record.
 
         Returns:
-            Whether it was queued. False: the queue is full, or writing has failed. Only messages are
-            dropped because the queue is full.
+            Whether it was queued. False: the queue is full, which holds for messages only, or writing
+            has failed.
         """
         if isinstance(record, Message) and not self._has_room(len(record.data) + OVERHEAD):
             return False
@@ -130,7 +126,8 @@ class JournalThread:
                     self._before_sync()
                     self._journal.flush()
                     self._journal.sync()
-                    self._check()
+                    if not self._journal.in_place():
+                        raise OSError(f'{self._journal.path} was removed, renamed or replaced')
                     synced = time.monotonic()
                 else:
                     self._journal.flush()
@@ -140,10 +137,6 @@ class JournalThread:
                 self._changed.notify_all()
             if closing:
                 return
-
-    def _check(self) -> None:
-        if not self._journal.in_place():
-            raise JournalGoneError(f'{self._journal.path} was removed, renamed or replaced')
 
 
 MAX_REASON = 500
@@ -157,22 +150,13 @@ class RecordingError(DiffdriveError):
     """A recording is not complete. The message says why, and where the recorded messages are."""
 
     def __init__(self, message: str, summary: Summary | None = None) -> None:
-        """Create the error.
-
-        Args:
-            message: What happened.
-            summary: Content of the bag. None: there is no bag.
-        """
+        """Create the error, with the content of the bag; None: there is no bag."""
         super().__init__(message)
         self.summary = summary
 
 
 class Recording:
-    """A journal that is on the disk within half a second, and is converted to a bag at the end.
-
-    It is written in a separate thread, so that a slow disk delays no callback. Messages that exceed the
-    capacity of its queue are dropped and counted.
-    """
+    """A journal that is on the disk within half a second, and is converted to a bag at the end."""
 
     def __init__(
         self,
@@ -230,11 +214,7 @@ class Recording:
 
     @classmethod
     def named_by_time(cls, prefix: str, storage: str, *, lossless: bool = False) -> Recording:
-        """Start a recording in the current directory, named `PREFIX_DATE-TIME`, or that and a number.
-
-        Raises:
-            OSError: It cannot be written there.
-        """
+        """Start a recording in the current directory, named `PREFIX_DATE-TIME`, or that and a number."""
         for name in names_by_time(prefix):
             # Other processes may take the same name.
             with suppress(FileExistsError):
@@ -293,7 +273,11 @@ class Recording:
         if not self.journal.in_place():
             self._raise_gone()
         try:
-            self._count_unwritten()
+            if self.error is not None:
+                # Messages that were queued, but could not be written, are lost.
+                written = Counter(one.channel for one in self._read() if isinstance(one, Message))
+                self._dropped += self._added - written + self._too_large
+                self._too_large.clear()
             summary = build_bag(
                 self._channels.values(),
                 chain(self._read(), self._notes()),
@@ -360,7 +344,6 @@ class Recording:
                     yield Message(numbers[found.channel], found.stamp, found.data)
 
     def _by_topic(self, counts: Counter[int]) -> Counter[str]:
-        """Return numbers of messages by topic instead of channel."""
         by_topic: Counter[str] = Counter()
         for channel, number in list(counts.items()):
             by_topic[self._channels[channel].topic] += number
@@ -378,14 +361,6 @@ class Recording:
             if note not in self._noted:
                 self.journal.add(note)
         self._noted = notes
-
-    def _count_unwritten(self) -> None:
-        """Count messages that were queued, but could not be written, as dropped."""
-        if self.error is None:
-            return
-        written = Counter(one.channel for one in self._read() if isinstance(one, Message))
-        self._dropped += self._added - written + self._too_large
-        self._too_large.clear()
 
     def _missing(self) -> str:
         """Return how many messages are neither in the journal nor in the bag; '': none that is known."""

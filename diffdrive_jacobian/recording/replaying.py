@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -28,13 +29,11 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from diffdrive_jacobian.bags.bag_reader import BagError, messages
+from diffdrive_jacobian.bags.bag_reader import BagError, messages, open_bag
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, message_class
-from diffdrive_jacobian.bags.run import open_bag
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.names import base_name, namespace_of, node_of
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
-from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.qos import publisher_profile
 from diffdrive_jacobian.ros.rclpy_internals import RCLError, reason, restart_timer
 from diffdrive_jacobian.ros.runner import ros_context, running
@@ -138,8 +137,8 @@ class Playback:
         """Return the time in the bag at which playing starts (ns).
 
         Raises:
-            BagError: The bag is not that long, or takes too long at this rate; or its times cannot be
-                published on /clock, or not at this rate.
+            BagError: The bag is too short for the offset, too long for the rate, or has times that
+                cannot be published on /clock, or not at this rate.
         """
         length = (reader.end_time - reader.start_time) / NANOSECONDS
         # An offset beyond the end can be too large for an integer of nanoseconds.
@@ -154,21 +153,16 @@ class Playback:
             raise BagError(
                 f'--rate must be at least {slowest:.3g} for a bag of {length:.3f} s, got {self.rate:g}'
             )
-        self._check_clock(reader)
-        return start
-
-    def _check_clock(self, reader: Reader) -> None:
-        """Raise BagError if the times of a bag cannot be published on /clock, or not at this rate."""
-        if self.clock is None:
-            return
         lowest, highest = CLOCK_RATES
-        if not lowest <= self.clock <= highest:
+        if self.clock is not None and not lowest <= self.clock <= highest:
             raise BagError(f'--clock must be in [{lowest:g}, {highest:g}] Hz, got {self.clock:g}')
-        if not -MAX_STAMP <= reader.start_time <= reader.end_time < MAX_STAMP:
+        valid = -MAX_STAMP <= reader.start_time <= reader.end_time < MAX_STAMP
+        if self.clock is not None and not valid:
             raise BagError(
                 f'{reader.path} cannot be played with --clock: a message on /clock must have less than '
                 f'{MAX_STAMP // NANOSECONDS} s, the bag ends at {reader.end_time / NANOSECONDS:.3f} s'
             )
+        return start
 
     def _wants(self, topic: str, topics: Collection[str]) -> bool:
         if topics:
@@ -180,11 +174,7 @@ class Playback:
 
 
 def _resolved(name: str, there: Sequence[str], reader: Reader) -> str:
-    """Return the fully qualified name of a topic of a bag.
-
-    Raises:
-        BagError: The bag does not have it, or has it in several namespaces, none of which is /.
-    """
+    """Return the fully qualified name of a topic of a bag."""
     for topic in (name, f'/{name}'):
         if topic in there:
             return topic
@@ -217,9 +207,8 @@ class Replayer(Node):  # type: ignore[misc]
 
         Raises:
             NothingToPlayError: The bag has no message of the selected topics, or none after the offset.
-            BagError: The bag cannot be played: it is too short for the offset, too long for the rate,
-                lacks a topic, or has messages of a type that is not installed; or a remapping or the
-                rate of /clock is invalid.
+            BagError: As of `Playback.choose`, `start` and `names_by_topic`; or a type is not installed,
+                or a new name is invalid.
         """
         connections, start = playback.choose(reader), playback.start(reader)
         names = playback.names_by_topic(connections)
@@ -249,9 +238,6 @@ class Replayer(Node):  # type: ignore[misc]
         self.position = self.start
         """Current time in the bag (ns)."""
         self._publishers_by_connection = {one.id: self._advertise(one) for one in self._connections}
-        self._clock_publisher: Publisher | None = None
-        if playback.clock:
-            self._clock_publisher = self.create_publisher(ClockMessage, '/clock', 10)
         self._coming: Iterator[tuple[Connection, int, bytes]] = iter(())
         self._next: tuple[Connection, int, bytes] | None = None
         self._wall = 0
@@ -259,6 +245,7 @@ class Replayer(Node):  # type: ignore[misc]
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._on_timer, clock=steady, autostart=False)
         if playback.clock:
+            self._clock_publisher = self.create_publisher(ClockMessage, '/clock', 10)
             self._ticks = self.create_timer(1.0 / playback.clock, self._publish_time, clock=steady)
 
     def _advertise(self, connection: Connection) -> Publisher:
@@ -279,11 +266,6 @@ class Replayer(Node):  # type: ignore[misc]
 
     # --- Subscriptions
 
-    @property
-    def unmatched(self) -> list[str]:
-        """The topics without a matched subscription."""
-        return [topic for topic, readers in self.readers().items() if not readers]
-
     def readers(self) -> dict[str, int]:
         """Return the number of matched subscriptions of each topic."""
         found: dict[str, int] = {}
@@ -298,22 +280,16 @@ class Replayer(Node):  # type: ignore[misc]
         ours = self.get_fully_qualified_name()
         found = {}
         for publisher in self._publishers_by_connection.values():
-            infos = self.get_publishers_info_by_topic(publisher.topic_name)
-            names = [node_of(info) for info in infos]
-            others = sorted(name for name in names if name != ours)
-            if others:
+            names = map(node_of, self.get_publishers_info_by_topic(publisher.topic_name))
+            if others := sorted(name for name in names if name != ours):
                 found[publisher.topic_name] = others
         return found
 
     def unacknowledged(self) -> list[str]:
         """Return the topics with a reliable subscription that has not acknowledged all messages."""
-        return sorted(
-            {
-                one.topic_name
-                for one in self._publishers_by_connection.values()
-                if not one.wait_for_all_acked(Duration(seconds=0))
-            }
-        )
+        publishers = self._publishers_by_connection.values()
+        now = Duration(seconds=0)
+        return sorted({one.topic_name for one in publishers if not one.wait_for_all_acked(now)})
 
     # --- Playback
 
@@ -380,7 +356,7 @@ class Replayer(Node):  # type: ignore[misc]
         restart_timer(self._timer, max(due - time.monotonic_ns(), 1))
 
     def _publish_time(self) -> None:
-        if self._clock_publisher is None or not self._wall or self.done:
+        if not self._wall or self.done:
             return
         now = self.position if self.paused else self._bag_time(time.monotonic_ns())
         message = ClockMessage()
@@ -500,7 +476,7 @@ def replay(
         running(context, isolated=False) as runner,
     ):
         player = runner.add(lambda: Replayer(reader, playback, context=context))
-        session = _Session(player, runner, signals, progress)
+        session = _Session(player, partial(runner.spin, signals=signals), progress)
         if readers is None:
             session.wait_for_discovery(patience)
         elif not session.wait_for_readers(readers, timeout):
@@ -511,7 +487,10 @@ def replay(
                 messages=0,
                 too_few=_too_few(player, readers),
             )
-        _warn(player)
+        for topic, others in player.other_publishers().items():
+            player.get_logger().warning(f'{", ".join(others)} also publishes on {topic}')
+        for topic in _too_few(player, 1):
+            player.get_logger().warning(f'no node is subscribed to {topic} (-w 1 waits for one)')
         played = session.play()
         unacknowledged: list[str] = []
         if played and acknowledgement_timeout is not None:
@@ -526,14 +505,6 @@ def replay(
         )
 
 
-def _warn(player: Replayer) -> None:
-    """Log which topics have other publishers, and which have no subscription."""
-    for topic, others in player.other_publishers().items():
-        player.get_logger().warning(f'{", ".join(others)} also publishes on {topic}')
-    for topic in player.unmatched:
-        player.get_logger().warning(f'no node is subscribed to {topic} (-w 1 waits for one)')
-
-
 def _too_few(player: Replayer, readers: int) -> dict[str, int]:
     """Return the number of subscriptions of each topic that has fewer than required."""
     return {topic: number for topic, number in player.readers().items() if number < readers}
@@ -546,96 +517,72 @@ def describe_too_few(counts: dict[str, int], readers: int) -> str:
     )
 
 
-class _Unchanged:
-    """Measures for how long a value has not changed."""
-
-    def __init__(self) -> None:
-        self._value: object = None
-        self._since = 0.0
-
-    def seconds(self, value: object) -> float:
-        """Return the time since the first call with this value (s)."""
-        now = time.monotonic()
-        if value != self._value:
-            self._value, self._since = value, now
-        return now - self._since
-
-
+@dataclass(frozen=True, slots=True)
 class _Session:
     """The stages of a replay."""
 
-    def __init__(
-        self, player: Replayer, runner: NodeRunner, signals: Signals, progress: ReplayProgress
-    ) -> None:
-        self._player = player
-        self._runner = runner
-        self._signals = signals
-        self._progress = progress
+    player: Replayer
+    spin: Callable[..., bool]
+    """`NodeRunner.spin` until a signal."""
+    progress: ReplayProgress
 
     def wait_for_discovery(self, patience: float) -> None:
         """Wait, at most so long (s), until each topic has a subscription and no more are discovered."""
-        unchanged = _Unchanged()
+        before: dict[str, int] = {}
+        since = time.monotonic()
 
         def complete() -> bool:
-            counts = self._player.readers()
-            quiet = unchanged.seconds(counts)
+            nonlocal before, since
+            counts = self.player.readers()
+            if counts != before:
+                before, since = counts, time.monotonic()
             without = ', '.join(topic for topic, count in counts.items() if not count)
-            self._progress.waiting(
+            self.progress.waiting(
                 f'no subscription to {without} (starting after {patience:g} s without it)'
                 if without
                 else 'further subscriptions may be discovered'
             )
-            return not without and quiet >= MATCH_QUIET
+            return not without and time.monotonic() - since >= MATCH_QUIET
 
-        self._runner.spin(complete, timeout=patience, signals=self._signals)
+        self.spin(complete, timeout=patience)
 
     def wait_for_readers(self, readers: int, timeout: float) -> bool:
         """Wait until each topic has so many subscriptions; return False after a time (s) or a signal."""
 
         def complete() -> bool:
-            missing = _too_few(self._player, readers)
-            if missing:
-                self._progress.waiting(describe_too_few(missing, readers))
+            if missing := _too_few(self.player, readers):
+                self.progress.waiting(describe_too_few(missing, readers))
             return not missing
 
-        return self._runner.spin(complete, timeout=timeout, signals=self._signals)
+        return self.spin(complete, timeout=timeout)
 
     def play(self) -> bool:
         """Play the bag; return whether it was played to its end."""
-        player = self._player
-        self._progress.started(seconds(player.end - player.start))
+        player = self.player
+        self.progress.started(seconds(player.end - player.start))
 
         def done() -> bool:
-            if self._progress.toggled():
+            if self.progress.toggled():
                 player.toggle()
-            self._progress.playing(seconds(player.position - player.start), paused=player.paused)
+            self.progress.playing(seconds(player.position - player.start), paused=player.paused)
             return player.done
 
         try:
             player.begin()
-            self._runner.spin(done, signals=self._signals)
+            self.spin(done)
         finally:
-            self._progress.ended()
+            self.progress.ended()
         return player.done
 
-    def wait_for_acknowledgements(self, seconds: float) -> list[str]:
-        """Wait until all subscriptions have acknowledged all messages.
-
-        Args:
-            seconds: Longest wait (s). 0: no limit.
-
-        Returns:
-            The topics with subscriptions that have not.
-        """
+    def wait_for_acknowledgements(self, timeout: float) -> list[str]:
+        """Wait at most so long (s; 0: no limit); return the topics that were not acknowledged."""
 
         def complete() -> bool:
-            if missing := self._player.unacknowledged():
+            if missing := self.player.unacknowledged():
                 topics = ', '.join(missing)
-                self._progress.waiting(
+                self.progress.waiting(
                     f'not all subscriptions to {topics} have acknowledged all messages'
                 )
             return not missing
 
-        if self._runner.spin(complete, timeout=seconds or math.inf, signals=self._signals):
-            return []
-        return self._player.unacknowledged()
+        return [] if self.spin(complete, timeout=timeout or math.inf) else self.player.unacknowledged()
