@@ -6,7 +6,7 @@ import json
 import shlex
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -44,37 +44,26 @@ class MetadataError(DiffdriveError, ValueError):
     """A value in a bag is invalid; the message says which, what it is, and what is allowed."""
 
 
-def check_metadata(source: Path | str) -> None:
-    """Check the content of metadata.yaml.
-
-    Args:
-        source: The file, or its text.
+def check_metadata(path: Path) -> None:
+    """Check metadata.yaml, whose values rosbags does not check.
 
     Raises:
-        OSError: The file cannot be read.
-        MetadataError: It, or a data file that it lists, is not a regular file; or it is not YAML of
-            moderate size; or one of its values is invalid.
+        NotARegularFileError: It, or a data file that it lists, is a directory, a pipe, ...
+        OSError: It cannot be read.
+        MetadataError: It is not YAML of moderate size, or one of its values is invalid.
     """
+    check_regular(path)
     try:
-        if isinstance(source, Path):
-            check_regular(source)
-        found = load_yaml(source)
-    except NotARegularFileError as error:
-        raise MetadataError(str(error)) from error
+        found = load_yaml(path)
     except TooLargeError as error:
         raise MetadataError(f'metadata.yaml is too large: {error}') from error
     except YAML_ERRORS as error:
         raise MetadataError(f'metadata.yaml is not valid YAML: {printable(error, 120)}') from error
     with _reported():
-        _check_content(found, source.parent if isinstance(source, Path) else None)
+        _check_content(found, path.parent)
 
 
-def _check_content(found: object, folder: Path | None) -> None:
-    """Check the content of metadata.yaml, and the data files in a folder; None: they are not checked.
-
-    Raises:
-        ValueError: A value is invalid.
-    """
+def _check_content(found: object, folder: Path) -> None:
     root = mapping(ROOT, _required(mapping('its content', found), ROOT))
     integer('version', _required(root, 'version'), 1, LATEST_VERSION)
     one_of('mcap', 'sqlite3')('storage_identifier', _required(root, 'storage_identifier'))
@@ -90,8 +79,9 @@ def _check_content(found: object, folder: Path | None) -> None:
                 f'{where} must be a file that is not listed before, got {short(path, repr)}'
             )
         names.add(Path(path).name)
-        if folder is not None:
-            _check_data_file(folder / Path(path).name)
+        # rosbags reports a file that is missing.
+        with suppress(FileNotFoundError):
+            check_regular(folder / Path(path).name)
     count = integer('message_count', _required(root, 'message_count'), 0, _INT64 - 1)
     for key, name in (('duration', 'nanoseconds'), ('starting_time', 'nanoseconds_since_epoch')):
         value = _required(mapping(key, _required(root, key)), name, key)
@@ -120,16 +110,6 @@ def _reported() -> Iterator[None]:
         raise
     except ValueError as error:
         raise MetadataError(f'metadata.yaml: {error}') from error
-
-
-def _check_data_file(path: Path) -> None:
-    try:
-        check_regular(path)
-    except NotARegularFileError as error:
-        raise MetadataError(str(error)) from error
-    except OSError:
-        # rosbags reports a file that is missing.
-        pass
 
 
 def _check_topic(topic: dict[str, Any], where: str) -> None:
@@ -164,11 +144,7 @@ def check_custom_data(custom: object) -> dict[str, str]:
 
 
 def parse_parameters(key: str, content: str) -> dict[str, Any]:
-    """Return the parameters of a node from an entry of the custom data.
-
-    Args:
-        key: The entry's key.
-        content: Its value.
+    """Return the parameters of a node from the key and the value of an entry of the custom data.
 
     Raises:
         MetadataError: It is not a JSON object.
@@ -185,14 +161,9 @@ def parse_parameters(key: str, content: str) -> dict[str, Any]:
 
 
 def check_connections(described: Iterable[Connection], stored: Iterable[Connection]) -> None:
-    """Check the topics of an open bag.
+    """Check the topics of an open bag, as metadata.yaml describes them and as its data files do.
 
-    rosbags reads a message only if metadata.yaml describes its topic exactly as the data file does, and
-    skips all others silently.
-
-    Args:
-        described: The bag's topics according to metadata.yaml.
-        stored: The topics of the data files. They are the same if the bag is a single file.
+    rosbags reads a message only if both are the same, and skips all others silently.
 
     Raises:
         MetadataError: A topic's name or type is not text, or a topic with messages is not described.
@@ -233,13 +204,10 @@ def _required(found: dict[str, Any], key: str, where: str = '') -> Any:
 
 
 class BagError(DiffdriveError):
-    """A bag cannot be read, or lacks what is needed; the message says which and what.
-
-    The message is safe to print, although names in it may come from the bag.
-    """
+    """A bag cannot be read, or lacks what is needed; the message says which and what."""
 
     def __init__(self, message: str) -> None:
-        """Escape control characters in the message."""
+        """Escape control characters in the message: names in it may come from the bag."""
         super().__init__(printable(message, PATH_LIMIT))
 
 
@@ -251,21 +219,14 @@ class DamagedBagError(BagError):
     """A bag is damaged; the message also names the command that saves what can be read."""
 
     def __init__(self, path: Path, why: str) -> None:
-        """Set the message.
-
-        Args:
-            path: The bag.
-            why: What is wrong with it.
-        """
+        """Set the message from the bag and what is wrong with it."""
         super().__init__(f'{printable(path, PATH_LIMIT)} is damaged: {why}{_advice(path)}')
         self.why = why
 
 
 def _advice(path: Path) -> str:
     """Return the command that saves the messages of a damaged bag, or '' if it has none."""
-    if not is_recoverable(path):
-        return ''
-    return f' ({_command(path)} saves what can be read)'
+    return f' ({_command(path)} saves what can be read)' if is_recoverable(path) else ''
 
 
 def _command(path: Path) -> str:
@@ -279,50 +240,41 @@ def open_bag(path: Path) -> Iterator[Reader]:
     Raises:
         BagError: There is none, or it is damaged.
     """
+    name = printable(path, PATH_LIMIT)
     if not path.exists():
         if (journal := journal_of(path)).is_file():
             raise BagError(
-                f'there is no bag {printable(path, PATH_LIMIT)}, but the journal of an interrupted '
-                f'recording: {_command(journal)} makes the bag of it'
+                f'there is no bag {name}, but the journal of an interrupted recording: '
+                f'{_command(journal)} makes the bag of it'
             )
-        raise BagError(f'there is no bag {printable(path, PATH_LIMIT)}')
-    if not path.is_dir():
-        _check_file(path)
-    elif not (path / 'metadata.yaml').exists():
+        raise BagError(f'there is no bag {name}')
+    if not path.is_dir() and not path.is_file():
+        raise BagError(f'{name} is not a bag: it is not a regular file')
+    if path.is_file() and not is_recoverable(path):
+        raise BagError(f'{name} is not a bag: it is neither MCAP nor SQLite')
+    if path.is_dir() and not (path / 'metadata.yaml').exists():
         what = 'an empty folder' if not any(path.iterdir()) else 'a folder without metadata.yaml'
-        raise BagError(f'{printable(path, PATH_LIMIT)} is {what}, not a bag{_advice(path)}')
+        raise BagError(f'{name} is {what}, not a bag{_advice(path)}')
     try:
         if path.is_dir():
             check_metadata(path / 'metadata.yaml')
         reader = BoundedReader(path)
         reader.open()
     except TooLargeError as error:
-        raise BagError(f'{printable(path, PATH_LIMIT)} cannot be read: {error}') from error
-    except MetadataError as error:
+        raise BagError(f'{name} cannot be read: {error}') from error
+    except (MetadataError, NotARegularFileError) as error:
         raise DamagedBagError(path, str(error)) from error
     except Exception as error:  # whatever the parsers of a damaged file raise
         raise DamagedBagError(path, f'it cannot be read: {printable(repr(error), 200)}') from error
     try:
-        _check_open(path, reader)
+        try:
+            custom_data(reader)
+            check_connections(reader.connections, stored_connections(reader))
+        except MetadataError as error:
+            raise DamagedBagError(path, str(error)) from error
         yield reader
     finally:
         reader.close()
-
-
-def _check_file(path: Path) -> None:
-    """Raise BagError unless a bag without a directory is a file of a known kind."""
-    if not path.is_file():
-        raise BagError(f'{printable(path, PATH_LIMIT)} is not a bag: it is not a regular file')
-    if not is_recoverable(path):
-        raise BagError(f'{printable(path, PATH_LIMIT)} is not a bag: it is neither MCAP nor SQLite')
-
-
-def _check_open(path: Path, reader: Reader) -> None:
-    try:
-        check_custom_data(reader.storage.metadata.custom)
-        check_connections(reader.connections, stored_connections(reader))
-    except MetadataError as error:
-        raise DamagedBagError(path, str(error)) from error
 
 
 def stored_connections(reader: Reader) -> list[Connection]:
@@ -342,11 +294,10 @@ def recorded_parameters(reader: Reader) -> dict[str, dict[str, Any]]:
     Raises:
         BagError: They are damaged.
     """
-    entries = custom_data(reader).items()
     try:
         return {
             key.removeprefix(PARAMETERS): parse_parameters(key, text)
-            for key, text in entries
+            for key, text in custom_data(reader).items()
             if key.startswith(PARAMETERS)
         }
     except MetadataError as error:

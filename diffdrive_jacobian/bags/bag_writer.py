@@ -79,15 +79,13 @@ class CheckedMcapWriter(McapWriter):
 
 
 class PathSqlite3Writer(Sqlite3Writer):
-    """rosbags' writer, which opens its file by the path and not by a URI."""
+    """rosbags' writer, which opens its file by the path and not by a URI.
+
+    In the URI `file:PATH` of rosbags `#`, `?` and `%` have a meaning: it would write another file.
+    """
 
     def __init__(self, path: Path, compression: CompressionMode) -> None:
-        """Create the file, named after the directory.
-
-        Args:
-            path: The bag's directory.
-            compression: Not supported by SQLite files.
-        """
+        """Create the file, named after the bag's directory."""
         if compression == CompressionMode.STORAGE:
             raise ValueError('SQLite files cannot be compressed as a whole while they are written')
         self.path = path.absolute() / f'{path.name}.db3'
@@ -105,7 +103,7 @@ class PathSqlite3Writer(Sqlite3Writer):
 
 
 class BagWriter(Writer):
-    """Writes a bag to any path."""
+    """rosbags' writer with these formats."""
 
     STORAGE_PLUGINS: Mapping[StoragePlugin, type[StorageWriter]] = {
         StoragePlugin.MCAP: CheckedMcapWriter,
@@ -132,11 +130,6 @@ class Summary:
 
 def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
     """Check that a bag can have this path, before anything is recorded for it.
-
-    Args:
-        target: The bag's directory.
-        storage: `mcap` or `sqlite3`.
-        replace: Whether it may replace another bag.
 
     Raises:
         FileExistsError: It exists, possibly as a broken symbolic link, and is not to be replaced or
@@ -165,9 +158,7 @@ def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
 
 def _is_nothing_but_a_bag(path: Path) -> bool:
     """Return whether a path is a directory with files of a bag only."""
-    if path.is_symlink() or not path.is_dir():
-        return False
-    files = list(path.iterdir())
+    files = [] if path.is_symlink() or not path.is_dir() else list(path.iterdir())
     return bool(files) and all(
         file.is_file()
         and (file.name == 'metadata.yaml' or file.suffix in BAG_SUFFIXES)
@@ -198,8 +189,8 @@ def build_bag(
         compressed: Whether the chunks of an MCAP file are compressed by zstd.
 
     Raises:
-        FileExistsError: `target` exists, and is not to be replaced or is not a bag.
-        OSError: It cannot be written, or is not read back as it was written. It is removed then.
+        OSError: As of `check_target`; or it cannot be written, or is not read back as it was written.
+            It is removed then.
     """
     check_target(target, storage, replace=replace)
     with scratch_directory(target) as scratch:
@@ -283,11 +274,14 @@ def _write(
         if isinstance(error, sqlite3.Error):
             raise OSError(errno.EIO, str(error)) from error
         raise
-    topics = {channel.topic: content.counts[channel.topic] for channel in channels.values()}
     left_out = describe_too_large(too_large)
     left_out += [f'{printable(key)}: metadata.yaml would be too large' for key in unwritten]
     summary = Summary(
-        messages=sum(topics.values()), topics=topics, start=start, end=end, left_out=tuple(left_out)
+        messages=content.counts.total(),
+        topics={channel.topic: content.counts[channel.topic] for channel in channels.values()},
+        start=start,
+        end=end,
+        left_out=tuple(left_out),
     )
     return summary, content
 
@@ -339,11 +333,7 @@ def _yaml_size(content: object) -> int:
 
 
 def _contents(path: Path) -> Content:
-    """Read a whole bag with the limits of all readers.
-
-    Raises:
-        OSError: It cannot be read.
-    """
+    """Read a whole bag with the limits of all readers, or raise OSError."""
     content = Content()
     try:
         with open_bag(path) as reader:

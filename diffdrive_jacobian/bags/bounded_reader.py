@@ -55,11 +55,7 @@ _MAX_FRAMES = 1000
 
 
 def check_record(size: int, what: str) -> None:
-    """Check the size of a message, chunk or other record before it is read or unpacked.
-
-    Raises:
-        TooLargeError: It is larger than `MAX_RECORD`.
-    """
+    """Raise TooLargeError if a message, chunk or other record is larger than `MAX_RECORD`."""
     if size > MAX_RECORD:
         raise TooLargeError(
             f'{what} unpacks to {format_size(size)}; at most {format_size(MAX_RECORD)} are read'
@@ -70,21 +66,12 @@ class Budget:
     """Total size that one file, or the files of one bag, may unpack to, in proportion to their size."""
 
     def __init__(self, packed: int, ratio: int = MAX_RATIO) -> None:
-        """Allow a multiple of the size of the file or files, and at least `FREE`.
-
-        Args:
-            packed: Their size (bytes).
-            ratio: The multiple.
-        """
+        """Allow a multiple of the size of the file or files (bytes), and at least `FREE`."""
         self.limit = max(FREE, ratio * packed)
         self._used = 0
 
     def spend(self, size: int) -> None:
-        """Count unpacked bytes.
-
-        Raises:
-            TooLargeError: More than the limit was unpacked.
-        """
+        """Count unpacked bytes, or raise TooLargeError if they are more than the limit."""
         self._used += size
         if self._used > self.limit:
             raise TooLargeError(
@@ -94,12 +81,9 @@ class Budget:
 
 
 def unpack(compression: str, data: bytes, size: int) -> bytes:
-    """Decompress a chunk of MCAP, or as much of it as there is.
+    """Decompress a chunk of MCAP by `lz4`, `zstd` or none (''), or as much of it as there is.
 
-    Args:
-        compression: `lz4`, `zstd`, or empty for none.
-        data: The chunk's data, which may be cut off.
-        size: The size that the chunk declares (bytes). At most one byte more is returned.
+    At most one byte more than `size`, which the chunk declares, is returned.
 
     Raises:
         TooLargeError: The declared size is larger than `MAX_RECORD`.
@@ -117,12 +101,7 @@ def unpack(compression: str, data: bytes, size: int) -> bytes:
 
 
 def unpack_message(data: bytes) -> bytes:
-    """Decompress a message that was compressed by itself.
-
-    Raises:
-        TooLargeError: It unpacks to more than `MAX_RECORD`.
-        zstd.ZstdError, EOFError: It is not Zstandard data, or is cut off.
-    """
+    """Decompress a message that was compressed by itself, or raise one of `UNPACK_ERRORS`."""
     declared = zstd.get_frame_info(data).decompressed_size
     if declared is not None:
         check_record(declared, 'a message')
@@ -151,12 +130,7 @@ def _unpack_zstd(data: bytes, limit: int, *, whole: bool = False) -> bytes:
 
 
 def unpack_file(path: Path, out: BinaryIO | None, budget: Budget | None = None) -> None:
-    """Decompress a file, or as much of it as there is.
-
-    Args:
-        path: A Zstandard file.
-        out: Where to write the content; None: only its size is checked.
-        budget: What the files of its bag may unpack to; None: that of the file alone.
+    """Decompress a Zstandard file, or as much of it as there is; without `out` only check its size.
 
     Raises:
         TooLargeError: It unpacks to more than a file of its size may.
@@ -194,11 +168,7 @@ MAX_KNOWN = 10_000
 
 
 def parse_bounded_qos(profiles: Any) -> list[Qos]:
-    """Parse offered profiles as `rosbags.rosbag2.metadata.parse_qos`, whose errors it raises.
-
-    Raises:
-        TooLargeError: The text, or what its aliases stand for, is too large.
-    """
+    """Parse offered profiles as `rosbags.rosbag2.metadata.parse_qos`, or raise TooLargeError."""
     if not isinstance(profiles, str):
         return parse_qos(profiles)
     parse = _parse_known_text if len(profiles) < MAX_KNOWN else _parse_text
@@ -222,10 +192,6 @@ for _module in (rosbags_reader, storage_mcap, storage_sqlite3):
     vars(_module)['parse_qos'] = parse_bounded_qos
 
 # --- MCAP
-
-_CHUNK = 0x06
-_HEAD = 9
-_CHUNK_HEAD = 24
 
 
 class _BoundedFile(io.BufferedReader):
@@ -329,24 +295,22 @@ class _McapReader(McapReader):
         yield from source
 
     def meta_scan(self) -> None:
-        if not self.chunks:
-            self._check_chunks()
-        super().meta_scan()
-
-    def _check_chunks(self) -> None:
-        """Add up the sizes that the chunks of a file without an index claim."""
         assert self.bio is not None
-        at = self.data_start
+        # Of a file without an index: add up the sizes that its chunks claim.
+        at = self.data_end if self.chunks else self.data_start
         while at < self.data_end:
             self.bio.seek(at)
-            head = self.bio.read(_HEAD + _CHUNK_HEAD)
-            if len(head) < _HEAD:
+            # Times and size of a chunk take 24 bytes.
+            head = self.bio.read(mcap.HEAD.size + 24)
+            if len(head) < mcap.HEAD.size:
                 break
-            if head[0] == _CHUNK:
-                size = int.from_bytes(head[_HEAD + 16 : _HEAD + 24], 'little')
+            opcode, length = mcap.HEAD.unpack_from(head)
+            if opcode == mcap.CHUNK:
+                size = int.from_bytes(head[mcap.HEAD.size + 16 :], 'little')
                 check_record(size, 'a chunk')
                 self._budget.spend(size)
-            at += _HEAD + int.from_bytes(head[1:_HEAD], 'little')
+            at += mcap.HEAD.size + length
+        super().meta_scan()
 
 
 # --- SQLite
@@ -358,34 +322,21 @@ _FREE_STEPS, _STEPS_PER_BYTE = 50_000_000, 100
 """Number of instructions that queries of a database may take: at least, and per byte of its file."""
 
 
-class PathSqlite3Reader(Sqlite3Reader):
-    """rosbags' reader, which opens its file by a URI in which the path is quoted."""
+class _SqliteReader(Sqlite3Reader):
+    """Reads plain tables only, and values of moderate size."""
 
     def __init__(self, path: Path) -> None:
-        """Set the file that `open` opens."""
+        # rosbags opens the URI `file:PATH`, in which `#`, `?` and `%` have a meaning.
         super().__init__(Path(quote(str(path.absolute()))))
         self.file = path
-
-    def open(self) -> None:
-        """Open the file.
-
-        Raises:
-            ReaderError: It cannot be opened; the message has its path as it was given.
-        """
-        try:
-            super().open()
-        except ReaderError as error:
-            raise ReaderError(str(error).replace(str(self.path), str(self.file))) from error
-
-
-class _SqliteReader(PathSqlite3Reader):
-    """Reads plain tables only, and values of moderate size."""
 
     def open(self) -> None:
         # The hook is called for every connection of the process, but this thread opens only rosbags'.
         apsw.connection_hooks.append(self._limit)
         try:
             super().open()
+        except ReaderError as error:
+            raise ReaderError(str(error).replace(str(self.path), str(self.file))) from error
         finally:
             apsw.connection_hooks.remove(self._limit)
 
@@ -447,15 +398,13 @@ class _DirectoryReader(DirectoryReader):
 
 def _compressed_files(folder: Path, metadata: Any) -> list[Path]:
     """Return the files of a bag that are compressed as a whole."""
-    try:
+    # rosbags reports what is missing or of another type.
+    with suppress(KeyError, TypeError, AttributeError):
         information = metadata['rosbag2_bagfile_information']
-        if information['compression_mode'].lower() != 'file':
-            return []
-        files = [folder / Path(name).name for name in information['relative_file_paths']]
-    except (KeyError, TypeError, AttributeError):
-        # rosbags reports what is missing or of another type.
-        return []
-    return [file for file in files if file.is_file()]
+        if information['compression_mode'].lower() == 'file':
+            files = [folder / Path(name).name for name in information['relative_file_paths']]
+            return [file for file in files if file.is_file()]
+    return []
 
 
 class BoundedReader(Reader):

@@ -62,20 +62,20 @@ def definition_and_hash(topic: Topic) -> tuple[str, str]:
     Raises:
         UnknownTypeError: The file lacks one of them, and the type is not known.
     """
+    known: Definition | None = None
     try:
         known = _known(topic.type_name)
-        if topic.type_hash == known.type_hash:
-            # The text in the file may be damaged, or differ in comments.
-            return known.text, known.type_hash
-        if topic.definition and topic.type_hash:
-            return topic.definition, topic.type_hash
-        if topic.definition in ('', known.text) and topic.type_hash in ('', known.type_hash):
-            return known.text, known.type_hash
         reason = f'{topic.type_name} is installed in another version than it was recorded'
     except UnknownTypeError as error:
-        if topic.definition and topic.type_hash:
-            return topic.definition, topic.type_hash
         reason = str(error)
+    # Where the hashes are the same, the text in the file may be damaged, or differ in comments.
+    if known is not None and (
+        topic.type_hash == known.type_hash
+        or (not topic.type_hash and topic.definition in ('', known.text))
+    ):
+        return known.text, known.type_hash
+    if topic.definition and topic.type_hash:
+        return topic.definition, topic.type_hash
     if not topic.definition:
         raise UnknownTypeError(reason)
     if len(topic.definition) > MAX_DEFINITION:
@@ -90,18 +90,12 @@ def definition_and_hash(topic: Topic) -> tuple[str, str]:
 
 
 def _known(type_name: str) -> Definition:
-    """Return the definition of an installed type, or of one that is known without ROS.
-
-    Raises:
-        UnknownTypeError: It is neither.
-    """
+    """Return the definition of an installed type, or of one that is known without ROS."""
     try:
         return definition(type_name)
     except UnknownTypeError:
-        try:
+        with suppress(UnknownTypeError):
             return known_definition(type_name)
-        except UnknownTypeError:
-            pass
         raise
 
 
@@ -122,16 +116,7 @@ LAST_ENCAPSULATION = 0x0B
 
 
 class DamagedBag:
-    """What is left of a bag, as records.
-
-    Attributes:
-        files: The data files, in their order.
-        storage: Storage of a new bag that is like the old one, `mcap` or `sqlite3`.
-        message_count: Number of messages according to metadata.yaml; None: it has none.
-        lost: Descriptions of what could not be read; complete after all records were read.
-        unchecked: What cannot be checked, so that losses would not be noticed; complete as `lost`.
-        left_out: Topics that cannot be written, and the reasons; complete as `lost`.
-    """
+    """What is left of a bag, as records."""
 
     def __init__(self, path: Path, scratch: Path) -> None:
         """Find the files, and decompress those that are compressed.
@@ -145,19 +130,25 @@ class DamagedBag:
             OSError: It cannot be read.
         """
         self.path = path
-        self.files = bag_files(path)
-        self.storage = file_kind(self.files[0])
+        files = bag_files(path)
+        self.storage = file_kind(files[0])
+        """Storage of a new bag that is like the old one, `mcap` or `sqlite3`."""
         self.lost: list[str] = []
+        """Descriptions of what could not be read. This and the next two are complete after all records
+        were read."""
         self.unchecked: list[str] = []
+        """What cannot be checked, so that losses would not be noticed."""
         self.left_out: dict[str, str] = {}
+        """Topics that cannot be written, and the reasons."""
         folder = path if path.is_dir() else path.parent
         self._metadata, self._problem = _metadata(folder / 'metadata.yaml')
         listed = _listed(self._metadata)
-        self._missing = listed - {file.name for file in self.files}
+        self._missing = listed - {file.name for file in files}
         if path.is_file() and (self._missing or not listed):
             self._metadata, self._missing = {}, set()
         self.message_count = self._metadata.get('message_count')
-        self._sources = [(file.name, _unpacked(file, scratch)) for file in self.files]
+        """Number of messages according to metadata.yaml; None: it has none."""
+        self._sources = [(file.name, _unpacked(file, scratch)) for file in files]
 
     @property
     def losses(self) -> list[str]:
@@ -188,7 +179,7 @@ class DamagedBag:
         source, metadata = 'metadata.yaml', self._metadata
         if not isinstance(self.message_count, int):
             source, metadata = 'the copy of metadata.yaml', self._copy
-            if not len(self.files) == len(_listed(metadata)) == 1:
+            if not len(self._sources) == len(_listed(metadata)) == 1:
                 # The copies in several files count what was written before them.
                 metadata = {}
         if self.path.is_dir() and not (metadata is self._metadata and _listed(metadata)):
@@ -196,8 +187,17 @@ class DamagedBag:
                 'there is no valid metadata.yaml, so files that are missing, or of another recording, '
                 'cannot be noticed'
             )
-            self._compare_times()
-        seen, counts = self._seen, _counts_by_topic(metadata)
+            # The parts of one recording follow one another.
+            self.unchecked += [
+                f'{second} begins before {first} ends: they may be of two recordings, or the same '
+                'messages twice'
+                for (_, end, first), (start, _, second) in pairwise(sorted(self._times))
+                if start < end
+            ]
+        seen, counts = self._seen, Counter[str]()
+        for described, number in _described_topics(metadata):
+            if isinstance(number, int):
+                counts[str(described.get('name'))] += number
         count = metadata.get('message_count')
         pairs = [(count, seen.total())] if isinstance(count, int) else []
         pairs += [(number, seen[topic]) for topic, number in counts.items()]
@@ -211,15 +211,6 @@ class DamagedBag:
             difference += f' ({topics})' if topics else ''
             fewer = any(number > found for number, found in pairs)
             (self.lost if fewer else self.unchecked).append(difference)
-
-    def _compare_times(self) -> None:
-        """Report files that cannot be parts of one recording, which follow one another."""
-        for (_, end, first), (start, _, second) in pairwise(sorted(self._times)):
-            if start < end:
-                self.unchecked.append(
-                    f'{second} begins before {first} ends: they may be of two recordings, or the same '
-                    'messages twice'
-                )
 
     def _compare_descriptions(self) -> None:
         """Compare metadata.yaml with the topics in the files, and with its copy there."""
@@ -279,13 +270,11 @@ class DamagedBag:
                     self.lost += [f'{name}: {problem}'] if problem else []
                     for text in _custom_data(metadata):
                         yield from self._text(text)
-                    continue
-                if isinstance(one, Text):
+                elif isinstance(one, Text):
                     if one.key == 'storage' and one.value in STORAGES:
                         self.storage = one.value
                     yield from self._text(one)
-                    continue
-                if isinstance(one, Topic):
+                elif isinstance(one, Topic):
                     known = channels.get((one.name, one.type_name))
                     channel = self._channel(one, channels)
                     ids[one.id] = None if channel is None else channel.id
@@ -294,17 +283,17 @@ class DamagedBag:
                         self._hashes[one.name, one.type_name] = one.type_hash
                     if channel is not None and channel != known:
                         yield channel
-                    continue
-                self._seen[names.get(one.channel, '')] += 1
-                if one.channel not in ids:
-                    faults['belong to no known topic'] += 1
-                elif (to := ids[one.channel]) is not None:
-                    data = _payload(one.data, budget)
-                    if data is None or not 0 <= one.stamp < 2**63:
-                        faults['are not CDR, are too large, or have an invalid time'] += 1
-                    else:
-                        start, end = min(start, one.stamp), max(end, one.stamp)
-                        yield Message(to, one.stamp, data)
+                else:
+                    self._seen[names.get(one.channel, '')] += 1
+                    if one.channel not in ids:
+                        faults['belong to no known topic'] += 1
+                    elif (to := ids[one.channel]) is not None:
+                        data = _payload(one.data, budget)
+                        if data is None or not 0 <= one.stamp < 2**63:
+                            faults['are not CDR, are too large, or have an invalid time'] += 1
+                        else:
+                            start, end = min(start, one.stamp), max(end, one.stamp)
+                            yield Message(to, one.stamp, data)
         self._times += [(start, end, name)] if end >= 0 else []
         self.lost += [f'{name}: {count} messages {what}' for what, count in faults.items()]
 
@@ -360,10 +349,9 @@ def _unpacked(file: Path, scratch: Path) -> Path:
 
 
 def _metadata(source: Path | str) -> tuple[dict[str, Any], str]:
-    """Read metadata.yaml, or its text in a data file.
+    """Return the content of metadata.yaml or of its text, {} if it is missing or damaged.
 
-    Returns:
-        The content, empty if it is missing or damaged, and the reason if it was not read at all.
+    And the reason if it was not read at all.
     """
     try:
         if isinstance(source, Path):
@@ -381,15 +369,6 @@ def _listed(metadata: dict[str, Any]) -> set[str]:
     """Return the names of the data files that metadata.yaml lists."""
     paths = metadata.get('relative_file_paths')
     return {Path(str(name)).name for name in paths} if isinstance(paths, list) else set()
-
-
-def _counts_by_topic(metadata: dict[str, Any]) -> Counter[str]:
-    """Return the numbers of messages in metadata.yaml, of the topics that it describes as it should."""
-    counts: Counter[str] = Counter()
-    for described, count in _described_topics(metadata):
-        if isinstance(count, int):
-            counts[str(described.get('name'))] += count
-    return counts
 
 
 def _described_topics(metadata: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Any]]:

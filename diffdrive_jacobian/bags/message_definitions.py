@@ -49,10 +49,7 @@ def is_known(type_name: str) -> bool:
 
 @cache
 def known_definition(type_name: str) -> Definition:
-    """Return the definition of a type that is known without ROS.
-
-    Args:
-        type_name: `package/msg/Name`.
+    """Return the definition of a type (`package/msg/Name`) that is known without ROS.
 
     Raises:
         UnknownTypeError: It is not known.
@@ -75,23 +72,16 @@ def known_structure(type_name: str) -> Structure:
 
 
 def recorded_definition_differs(type_name: str, type_hashes: Iterable[str]) -> bool:
-    """Return whether a type was recorded with another definition than the known one.
+    """Return whether a known type was recorded with another definition, by its hashes in a bag.
 
-    Args:
-        type_name: `package/msg/Name`; it is known.
-        type_hashes: Hashes that a bag has for it. Those that are empty or no RIHS01 hash do not count.
+    Hashes that are empty or no RIHS01 hash do not count.
     """
     known = _typestore().hash_rihs01(type_name)
     return any(_HASH.fullmatch(one) and one != known for one in type_hashes)
 
 
 def type_hashes(connection: Connection, stored: Iterable[Connection]) -> list[str]:
-    """Return what a bag says about the hash of a topic's type: in metadata.yaml and in its data files.
-
-    Args:
-        connection: The topic, as metadata.yaml has it.
-        stored: The topics of the data files.
-    """
+    """Return the hashes of a topic's type in metadata.yaml and in the data files (`stored`)."""
     alike = (one for one in stored if (one.topic, one.msgtype) == (connection.topic, connection.msgtype))
     return [str(one.digest) for one in (connection, *alike)]
 
@@ -122,10 +112,7 @@ class Definition:
 
 @cache
 def definition(name: str) -> Definition:
-    """Return the definition of an installed message type.
-
-    Args:
-        name: `package/msg/Name`.
+    """Return the definition of an installed message type (`package/msg/Name`).
 
     Raises:
         UnknownTypeError: No installed package defines it, or its files are invalid.
@@ -144,10 +131,7 @@ def definition(name: str) -> Definition:
 
 @cache
 def message_class(name: str) -> Any:
-    """Return the Python class of a message type.
-
-    Args:
-        name: `package/msg/Name`.
+    """Return the Python class of a message type (`package/msg/Name`).
 
     Raises:
         UnknownTypeError: No installed package defines it, or its Python code or its type support is not
@@ -164,17 +148,8 @@ def message_class(name: str) -> Any:
         raise UnknownTypeError(
             f'the Python code of {name} cannot be imported: {printable(repr(error))}'
         ) from error
-    _load_type_support(name, found)
-    return found
-
-
-def _load_type_support(name: str, found: Any) -> None:
-    """Load the type support of a message class, as rclpy does when it creates a subscription.
-
-    Raises:
-        UnknownTypeError: It is not installed or cannot be loaded.
-    """
-    kind = type(found)
+    # As rclpy does when it creates a subscription.
+    kind: Any = type(found)
     try:
         if kind._TYPE_SUPPORT is None:
             kind.__import_type_support__()
@@ -186,12 +161,12 @@ def _load_type_support(name: str, found: Any) -> None:
         ) from error
     if missing:
         raise UnknownTypeError(f'the type support of {name} is not installed')
+    return found
 
 
 def _split(name: str) -> tuple[str, str]:
     """Return package and message of a valid name of a message type."""
-    match = _NAME.fullmatch(name)
-    if match is None:
+    if (match := _NAME.fullmatch(name)) is None:
         raise UnknownTypeError(
             f'a message type must be named package/msg/Name, got {printable(repr(name))}'
         )
@@ -211,14 +186,8 @@ def _full_text(package: str, message: str, seen: set[tuple[str, str]]) -> str:
 
 
 def _dependencies(package: str, text: str) -> set[tuple[str, str]]:
-    found = set()
-    for line in text.splitlines():
-        match = _FIELD.match(line)
-        if match is None or _PRIMITIVE.fullmatch(match.group(1)):
-            continue
-        owner, _, name = match.group(1).rpartition('/')
-        found.add((owner or package, name))
-    return found
+    types = (match[1].rpartition('/') for match in map(_FIELD.match, text.splitlines()) if match)
+    return {(owner or package, name) for owner, _, name in types if not _PRIMITIVE.fullmatch(name)}
 
 
 def _file(package: str, message: str, ending: str) -> Path:

@@ -149,10 +149,7 @@ class Run:
         return found[0] if len(found) == 1 else {}
 
     def configurations(self) -> Iterator[tuple[int, Run]]:
-        """Yield the run with the parameters of each time, and since when they are valid (ns).
-
-        Those of the beginning are valid since 0.
-        """
+        """Yield the run with the parameters of each time, and since when they are valid (ns), from 0."""
         run, since = self, 0
         yield since, run
         for received, node, values in self.parameter_events:
@@ -256,10 +253,9 @@ def read_run(
                 elif isinstance(value, FaultEvent):
                     fault_events.append((received, value.fault, value.what))
                 else:
-                    found = [
+                    rows[topic.series] += [
                         (received, stamp or received, row) for stamp, row in topic.rows(value, names)
                     ]
-                    rows[topic.series].extend(found)
             except LongMessageError:
                 tally.refused[connection.topic] += 1
             except DecodingError:
@@ -272,10 +268,16 @@ def read_run(
     for topic in TOPICS.values():
         if topic.series in series or not topic.series:
             continue
-        one = _series(rows[topic.series], topic.columns + topic.covariances)
-        count = len(topic.columns)
-        covariances[topic.series] = one.values[:, count:].copy()
-        series[topic.series] = replace(one, values=one.values[:, :count].copy(), columns=topic.columns)
+        found, count = rows[topic.series], len(topic.columns)
+        values = np.array([row for *_, row in found], dtype=np.float64)
+        values = values.reshape(len(found), count + len(topic.covariances))
+        covariances[topic.series] = values[:, count:].copy()
+        series[topic.series] = Series(
+            received=np.array([received for received, *_ in found], dtype=np.int64),
+            stamps=np.array([stamp for _, stamp, _ in found], dtype=np.int64),
+            values=values[:, :count].copy(),
+            columns=topic.columns,
+        )
     return Run(
         path=path,
         odometry_covariances=covariances['odometry'],
@@ -333,39 +335,33 @@ class _Tally:
 
 
 def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dict[int, Topic]:
-    """Return which connections are which topics of a run, by the id of the connection.
-
-    Raises:
-        BagError: A given topic is missing or has another type, a name has several topics, or the
-            namespace has none.
-    """
+    """Return which connections are which topics of a run, by the id of the connection."""
     chosen: dict[int, Topic] = {}
     if unknown := sorted(set(given) - READABLE.keys()):
         raise BagError(f'topics must be among {", ".join(sorted(READABLE))}, got {unknown[0]!r}')
     for name, topic in sorted(READABLE.items()):
-        candidates = [
-            connection
-            for connection in reader.connections
-            if (
-                connection.topic == given[name]
+        matching = [
+            one
+            for one in reader.connections
+            if one.msgtype in topic.types
+            and (
+                one.topic == given[name]
                 if name in given
-                else base_name(connection.topic) == name
-                and (topic.shared or namespace in (None, namespace_of(connection.topic)))
+                else base_name(one.topic) == name
+                and (topic.shared or namespace in (None, namespace_of(one.topic)))
             )
         ]
-        matching = [connection for connection in candidates if connection.msgtype in topic.types]
         if name in given and not matching:
             raise BagError(
                 f'{reader.path} has no topic {given[name]} of {" or ".join(sorted(topic.types))}; '
                 f'it has {", ".join(sorted({one.topic for one in reader.connections})) or "none"}'
             )
-        if len({connection.topic for connection in matching}) > 1:
+        if len(names := {one.topic for one in matching}) > 1:
             raise BagError(
-                f'{reader.path} has several topics {name}: '
-                f'{", ".join(sorted({one.topic for one in matching}))}; choose one of them, or one '
-                'namespace (--namespace)'
+                f'{reader.path} has several topics {name}: {", ".join(sorted(names))}; '
+                'choose one of them, or one namespace (--namespace)'
             )
-        chosen.update((connection.id, topic) for connection in matching)
+        chosen.update((one.id, topic) for one in matching)
     if namespace is not None and all(topic.shared for topic in chosen.values()):
         of_robots = {name for name, topic in READABLE.items() if not topic.shared}
         topics = (one.topic for one in reader.connections)
@@ -383,12 +379,3 @@ def _wheel_names(parameters: dict[str, dict[str, Any]]) -> tuple[str, str]:
         if isinstance(left, str) and isinstance(right, str):
             return left, right
     return WHEELS
-
-
-def _series(rows: list[tuple[int, int, tuple[float, ...]]], columns: tuple[str, ...]) -> Series:
-    return Series(
-        received=np.array([row[0] for row in rows], dtype=np.int64),
-        stamps=np.array([row[1] for row in rows], dtype=np.int64),
-        values=np.array([row[2] for row in rows], dtype=np.float64).reshape(len(rows), len(columns)),
-        columns=columns,
-    )

@@ -171,19 +171,16 @@ def _breaks(run: Run) -> Indices:
 
 def _over_time(run: Run, value: Callable[[Run], float]) -> Array:
     """Return what a function of the parameters is at each odometry, shape (n,)."""
-    changes = [(since, value(now)) for since, now in run.configurations()]
-    since, values = np.array([one for one, _ in changes]), np.array([one for _, one in changes])
+    since, configurations = zip(*run.configurations(), strict=True)
+    values = np.array([value(now) for now in configurations], dtype=np.float64)
     latest = np.searchsorted(since, run.odometry.received, side='right') - 1
-    return np.asarray(values[np.maximum(latest, 0)], dtype=np.float64)
+    return np.asarray(values[np.maximum(latest, 0)])
 
 
 def _progress(
     run: Run, breaks: Indices, routes: list[Followed]
 ) -> tuple[Indices, NDArray[np.bool_], Indices]:
-    """Return for each odometry which goal is driven to, -1 for none, and whether it is reached.
-
-    And which route is the path that is driven along, -1 for none.
-    """
+    """Return for each odometry the goal driven to, whether it is reached, and the path driven along."""
     seen = run.odometry.received
     places = np.column_stack([_driven_points(run), _over_time(run, tolerance)])
     goal, reached = np.full(len(seen), -1), np.zeros(len(seen), dtype=bool)
@@ -283,13 +280,7 @@ def _distances(run: Run, places: Array, target: int) -> Array:
 
 
 def _within(run: Run, places: Array, target: int) -> Mask:
-    """Return for each place whether it counts as arrived at a goal, shape (n,).
-
-    Args:
-        run: The run.
-        places: `[x, y, tolerance]` of each, shape (n, 3) (m).
-        target: The goal.
-    """
+    """Return which places `[x, y, tolerance]` (m) count as arrived at a goal, shape (n,)."""
     return np.asarray(_distances(run, places, target) <= places[:, 2] + 1e-12)
 
 
@@ -345,25 +336,16 @@ def _routes(run: Run) -> list[Followed]:
     A message that was not recorded was sent when its goal was accepted, and has no rows.
     """
     statuses = run.goal_status
-    routes = sorted(
-        [
-            *_sent(run, run.goals, MAX_WAYPOINTS, is_path=False),
-            *_sent(run, run.planned_path, MAX_PATH_POSES, is_path=True),
-        ],
-        key=attrgetter('received'),
-    )
-    received = [route.received for route in routes]
-    reports = [
-        *zip(
-            statuses.values[:, 0].astype(int).tolist(),
-            _stamps(run, statuses),
-            statuses.received.tolist(),
-            strict=True,
-        )
+    routes = [
+        *_sent(run, run.goals, MAX_WAYPOINTS, is_path=False),
+        *_sent(run, run.planned_path, MAX_PATH_POSES, is_path=True),
     ]
+    routes.sort(key=attrgetter('received'))
+    values = statuses.values[:, 0].astype(int).tolist()
+    reports = [*zip(values, _stamps(run, statuses), statuses.received.tolist(), strict=True)]
     follower: GoalFollower[Sent] = GoalFollower()
-    answered: list[int] = np.searchsorted(statuses.received, received).tolist()
-    answered.append(len(reports))
+    received = [route.received for route in routes]
+    answered = [*np.searchsorted(statuses.received, received).tolist(), len(reports)]
     for report in reports[: answered[0]]:
         follower.reported(*report)
     followed = []
@@ -391,18 +373,17 @@ def _stamps(run: Run, series: Series) -> list[Stamp]:
 
 
 def _driven_points(run: Run) -> Array:
-    """Return the point that the controller drives to the goal, shape (n, 2).
-
-    It is the axle centre if the controller is not built in. Its package may not be installed here, and
-    reading a bag must not import it.
-    """
+    """Return the point that the controller drives to the goal, shape (n, 2)."""
     x, y, theta = run.odometry.values[:, :3].T
     d = _over_time(run, _driven_offset)
     return np.column_stack([x + d * np.cos(theta), y + d * np.sin(theta)])
 
 
 def _driven_offset(run: Run) -> float:
-    """Return how far the driven point is ahead of the axle centre (m)."""
+    """Return how far the driven point is ahead of the axle centre (m), 0 of a law of other packages.
+
+    Reading a bag must not import these.
+    """
     name = run.of_node('go_to_goal').get('controller')
     controller = BUILT_IN.get(name) if isinstance(name, str) else None
     if controller is None or not controller.offset:

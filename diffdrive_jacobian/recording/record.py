@@ -56,14 +56,7 @@ def open_recording(
     lossless: bool = False,
     replace: bool = False,
 ) -> Recording:
-    """Start a recording to a path of the user, or to a new one that is named by the time.
-
-    Args:
-        prefix: Beginning of the name where the user gave none.
-        output: Path of the bag. None: `PREFIX_DATE-TIME` in the current directory.
-        storage: `mcap` or `sqlite3`.
-        lossless: Whether to wait for a slow disk, as in simulated time, or to drop messages.
-        replace: Whether a path of the user may be that of another bag, which is replaced at the end.
+    """Start a `Recording` to a path of the user; None: `PREFIX_DATE-TIME` in the current directory.
 
     Raises:
         OSError: The bag exists or cannot be written. The message names it.
@@ -195,9 +188,8 @@ def _status(recorder: Recorder, recording: Recording) -> Status:
 
 def _published(node: Node) -> list[str]:
     """Return the topics that have a publisher. Those that every node publishes are left out."""
-    topics = sorted(topic for topic, _ in node.get_topic_names_and_types())
     found = []
-    for topic in topics:
+    for topic, _ in sorted(node.get_topic_names_and_types()):
         # A DDS application without ROS can use any name.
         with suppress(ValueError, NameValidationException):
             if topic not in OF_EVERY_NODE and node.count_publishers(topic):

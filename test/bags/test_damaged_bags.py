@@ -137,7 +137,7 @@ def test_a_damaged_value_is_named_and_recovered(whole, tmp_path, key, changes):
         shutil.copy(whole['mcap'] / 'metadata.yaml', tmp_path)
         edit(tmp_path, *change)
         with pytest.raises(MetadataError) as caught:
-            check_metadata((tmp_path / 'metadata.yaml').read_text())
+            check_metadata(tmp_path / 'metadata.yaml')
         assert 'metadata.yaml' in str(caught.value), change
         assert key in str(caught.value), change
     storage = list(PLUGINS)[len(key) % 2]
@@ -158,7 +158,7 @@ def test_all_tools_agree_on_a_damaged_bag(bag, tmp_path, tools, key, value):
     else:
         # Only the data file shows that it is wrong.
         edit(bag, TOPICS, topic_index(bag), 'topic_metadata', key, value)
-        check_metadata((bag / 'metadata.yaml').read_text())
+        check_metadata(bag / 'metadata.yaml')
     bag = bag.rename(tmp_path / 'a bag')
     named = 'version' if key == 'version' else '/odom'
     for tool in (plot_run, replay_run):
