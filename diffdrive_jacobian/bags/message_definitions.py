@@ -11,20 +11,28 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Connection
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.interfaces import Connection, Nodetype
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.names import import_type
-from diffdrive_jacobian.messages.structure import Structure, defined
+from diffdrive_jacobian.messages.structure import (
+    CODES,
+    Array,
+    FieldType,
+    Number,
+    Sequence,
+    Structure,
+    Text,
+)
 from diffdrive_jacobian.text import printable
 
 GOALS = 'nav_msgs/msg/Goals'
@@ -32,6 +40,10 @@ GOALS_DEFINITION = """std_msgs/Header header
 geometry_msgs/PoseStamped[] goals
 """
 """The only type of ROS 2 Jazzy that is read here and that rosbags lacks."""
+_NUMBERS = {'bool': 'boolean', 'byte': 'octet', 'char': 'uint8', 'float32': 'float', 'float64': 'double'}
+"""Types of numbers in .msg files to their names in rosidl, where these differ."""
+_NONE = 'structure_needs_at_least_one_member'
+"""The only field of a message without fields, as rosbags has it."""
 _HASH = re.compile('RIHS01_[0-9a-f]{64}')
 
 
@@ -68,7 +80,45 @@ def known_structure(type_name: str) -> Structure:
     Raises:
         UnknownTypeError: It is not known.
     """
-    return defined(type_name, known_definition(type_name).text)
+    if not is_known(type_name):
+        raise UnknownTypeError(f'{printable(type_name)} is not a type of ROS 2 Jazzy')
+    return _structure(_typestore().fielddefs, type_name)
+
+
+def installed_structure(type_name: str) -> Structure:
+    """Return the types of the fields of an installed message type.
+
+    Raises:
+        UnknownTypeError: No installed package defines it, or its files are invalid.
+    """
+    text = definition(type_name).text
+    try:
+        return _structure(get_types_from_msg(text, type_name), type_name)
+    except (TypesysError, LookupError, RecursionError) as error:
+        raise UnknownTypeError(
+            f'the installed definition of {type_name} is invalid: {printable(repr(error))}'
+        ) from error
+
+
+def _structure(definitions: Mapping[str, Any], name: str) -> Structure:
+    """Return the types of the fields of a message from definitions that rosbags has parsed."""
+
+    def field(described: Any) -> FieldType:
+        node, content = described
+        if node == Nodetype.NAME:
+            return _structure(definitions, content)
+        kind, count = content
+        if node == Nodetype.ARRAY:
+            return Array(field(kind), count)
+        if node == Nodetype.SEQUENCE:
+            return Sequence(field(kind), count or None)
+        if kind in ('string', 'wstring'):
+            return Text(kind == 'wstring', count or None)
+        return Number(CODES[_NUMBERS.get(kind, kind)])
+
+    _, fields = definitions[name]
+    own = ((field_name, field(described)) for field_name, described in fields if field_name != _NONE)
+    return Structure(name.replace('/msg/', '/'), tuple(own))
 
 
 def recorded_definition_differs(type_name: str, type_hashes: Iterable[str]) -> bool:

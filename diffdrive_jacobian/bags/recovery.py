@@ -6,6 +6,7 @@ import json
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -24,10 +25,15 @@ from diffdrive_jacobian.bags.journal import (
     Record,
     is_being_written,
 )
-from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, known_definition
+from diffdrive_jacobian.bags.message_definitions import (
+    UnknownTypeError,
+    definition,
+    installed_structure,
+    known_definition,
+    known_structure,
+)
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
-from diffdrive_jacobian.messages.structure import DefinitionError, defined
 from diffdrive_jacobian.text import printable
 
 Decoder = Callable[[bytes], Any]
@@ -37,14 +43,11 @@ Decoder = Callable[[bytes], Any]
 def _decoder(channel: Channel) -> Decoder | None:
     """Return a function that decodes the messages of a channel; None: its definition is not known."""
     name = channel.type_name
-    for known in (known_definition, definition):
-        try:
-            found = known(name)
-            if found.type_hash == channel.type_hash:
-                return Reader(defined(name, found.text), (), bounded=False)
-        except (UnknownTypeError, DefinitionError, TypeError):
-            # The type is not installed, or has what is not read here.
-            continue
+    for known, types in ((known_definition, known_structure), (definition, installed_structure)):
+        # The type is not installed, or has what is not read here.
+        with suppress(UnknownTypeError, TypeError):
+            if known(name).type_hash == channel.type_hash:
+                return Reader(types(name), (), bounded=False)
     return None
 
 

@@ -166,7 +166,9 @@ class GoalFollower(Generic[G]):
             self.driving = followed
             followed.accepted, followed.replaced, followed.earlier = True, False, None
         else:
-            followed.replaced = state is not GoalState.SUCCEEDED and self._makes_room(followed)
+            newest = self.newest
+            makes_room = newest is not None and newest is not followed and not newest.state.ended
+            followed.replaced = state is not GoalState.SUCCEEDED and followed.accepted and makes_room
             if self.driving is followed:
                 self.driving = None
         return None if followed.fate is before else followed
@@ -188,16 +190,6 @@ class GoalFollower(Generic[G]):
         followed = FollowedGoal(None, stamp)
         self._remember(followed)
         return followed
-
-    def _makes_room(self, followed: FollowedGoal[G]) -> bool:
-        """Return whether a goal that is ended makes room for a later one."""
-        newest = self.newest
-        return (
-            followed.accepted
-            and newest is not None
-            and newest is not followed
-            and not newest.state.ended
-        )
 
     def _remember(self, followed: FollowedGoal[G]) -> None:
         self._goals.pop(followed.stamp, None)

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeAlias
 
-from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import import_type
 
-_CODES = {
+CODES = {
     'boolean': '?',
     'octet': 'c',
     'int8': 'b',
@@ -30,25 +29,11 @@ _CODES = {
 }
 """Format characters of the module `struct`, by the names that rosidl gives the types of numbers."""
 _SIZES = {'?': 1, 'c': 1, 'b': 1, 'B': 1, 'h': 2, 'H': 2, 'i': 4, 'I': 4, 'q': 8, 'Q': 8, 'f': 4, 'd': 8}
-_IN_DEFINITIONS = {
-    **{name: name for name in _CODES if 'int' in name},
-    **{'bool': 'boolean', 'byte': 'octet', 'char': 'uint8', 'float32': 'float', 'float64': 'double'},
-}
-"""Names of these types in .msg files, and those of rosidl."""
 _NESTED = re.compile(
     r'(?P<array>.+)\[(?P<count>\d+)\]|sequence<(?P<sequence>[^,]+)(?:, (?P<most>\d+))?>'
 )
 _TEXT = re.compile(r'(?P<wide>w?)string(?:<=?(?P<most>\d+)>?)?')
 _CLASS = re.compile(r'(\w+)/(\w+)')
-_LINE = re.compile(
-    r'\s*(?P<type>[A-Za-z][\w/]*(?:<=\d{1,9})?)(?P<nested>\[(?:<=)?\d{,9}\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)',
-    re.ASCII,
-)
-_SEPARATOR = re.compile(r'^=+\nMSG: (\S+)\n', re.MULTILINE)
-
-
-class DefinitionError(MessageError):
-    """A definition of a message type that is invalid or incomplete."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +63,7 @@ class Number:
 
     def __str__(self) -> str:
         """Return the name of the type, as rosidl has it."""
-        return next(name for name, code in _CODES.items() if code == self.code)
+        return next(name for name, code in CODES.items() if code == self.code)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,8 +155,8 @@ def _structure(message_class: Any) -> Structure:
 
 def _of_class(name: str, text: str) -> FieldType:
     """Return a type that rosidl describes, such as `sequence<double, 3>`."""
-    if text in _CODES:
-        return Number(_CODES[text])
+    if text in CODES:
+        return Number(CODES[text])
     if found := _TEXT.fullmatch(text):
         return Text(bool(found['wide']), _number(found['most']))
     if (found := _NESTED.fullmatch(text)) and found['array']:
@@ -182,80 +167,6 @@ def _of_class(name: str, text: str) -> FieldType:
         # Fields of messages are messages; those of services and actions too.
         return structure(import_type(f'{found[1]}/msg/{found[2]}'))
     raise TypeError(f'field {name} must have a type of ROS 2, got {text}')
-
-
-def defined(name: str, text: str) -> Structure:
-    """Return the types of the fields of a message from its definition, as bags store it.
-
-    Args:
-        name: `package/msg/Name`.
-        text: Its .msg file, followed by those of the messages in its fields, each after a line of `=`
-            and one of `MSG: ` and its name.
-
-    Raises:
-        DefinitionError: The definition is invalid, lacks that of a field, or contains itself.
-    """
-    first, *rest = _SEPARATOR.split(text.replace('\r\n', '\n'))
-    texts = {_class_name(one): content for one, content in zip(rest[::2], rest[1::2], strict=True)}
-    try:
-        return _Definitions({**texts, _class_name(name): first}).structure(_class_name(name))
-    except RecursionError as error:
-        raise DefinitionError(f'the definitions in {name} are nested too deep') from error
-
-
-class _Definitions:
-    """The .msg files of a type and of its fields, by `package/Name`."""
-
-    def __init__(self, texts: dict[str, str]) -> None:
-        self._texts = texts
-        self._known: dict[str, Structure | None] = {}
-        """None while it is read."""
-
-    def structure(self, name: str) -> Structure:
-        if name not in self._known:
-            if name not in self._texts:
-                raise DefinitionError(f'the definition of {name} is missing')
-            self._known[name] = None
-            self._known[name] = Structure(name, tuple(self._fields(name)))
-        known = self._known[name]
-        if known is None:
-            raise DefinitionError(f'{name} contains itself')
-        return known
-
-    def _fields(self, name: str) -> Iterator[tuple[str, FieldType]]:
-        package = name.partition('/')[0]
-        for line in self._texts[name].split('\n'):
-            content = line.partition('#')[0]
-            if not content.strip():
-                continue
-            found = _LINE.fullmatch(content)
-            if found is None:
-                raise DefinitionError(f'{name} has the line {line[:80]!r}, which is no field')
-            # What has a value after an equals sign is a constant; other values are defaults.
-            if found['rest'].startswith('='):
-                continue
-            yield found['name'], self._field(package, found['type'], found['nested'])
-
-    def _field(self, package: str, kind: str, nested: str | None) -> FieldType:
-        if kind in _IN_DEFINITIONS:
-            element: FieldType = Number(_CODES[_IN_DEFINITIONS[kind]])
-        elif found := _TEXT.fullmatch(kind):
-            element = Text(bool(found['wide']), _number(found['most']))
-        else:
-            element = self.structure(_class_name(kind if '/' in kind else f'{package}/{kind}'))
-        if nested is None:
-            return element
-        count = nested.strip('[]')
-        if count == '0':
-            raise DefinitionError('an array must have at least 1 element, got 0')
-        if count.isdecimal():
-            return Array(element, int(count))
-        return Sequence(element, _number(count.removeprefix('<=')))
-
-
-def _class_name(name: str) -> str:
-    """Return `package/Name` of `package/msg/Name`."""
-    return name.replace('/msg/', '/')
 
 
 def _number(text: str | None) -> int | None:
@@ -314,14 +225,8 @@ def walk(
 ) -> Iterator[tuple[str, FieldType, Any]]:
     """Yield path, type and value of each field of a message.
 
-    An array or a sequence of numbers or strings is one value. One of messages is its length,
-    `len(path)`, and then the fields of its elements, `path[0].x`.
-
-    Args:
-        kind: Type of the message.
-        value: The message.
-        path: What precedes the paths.
-        whole: Says which other types are one value, too.
+    An array or a sequence of numbers or strings is one value, as are types that are `whole`. One of
+    messages is its length, `len(path)`, and then the fields of its elements, `path[0].x`.
     """
     match kind:
         case _ if whole(kind):
@@ -362,13 +267,9 @@ class MessageField:
     """A field of a message class: a value, a structure, or all elements of an array of values."""
 
     def __init__(self, message_class: Any, path: str) -> None:
-        """Find the field.
+        """Find the field by its path, such as `poses[0].pose.position.x`.
 
-        Args:
-            message_class: The class.
-            path: Names of the fields, separated by dots, each with the index of an element if it is an
-                array or a sequence: `poses[0].pose.position.x`. Without an index at its end it means all
-                elements of an array.
+        Without an index at its end the path of an array or a sequence means all elements.
 
         Raises:
             ValueError: There is no such field. The message names those that there are.
@@ -402,14 +303,10 @@ class MessageField:
         """Type of the value, or of the elements."""
 
     def replace(self, message: Any, change: Callable[[Any], Any]) -> bool:
-        """Replace the value in a message, or each element of an array.
+        """Replace the value in a message, or each element of an array, by that which `change` returns.
 
-        Args:
-            message: The message.
-            change: Returns the new value. A structure is changed in place by it and returned.
-
-        Returns:
-            Whether there is anything else than before. There is not if the message has no such element.
+        `change` may change a structure in place. Return whether there is anything else than before.
+        There is not if the message has no such element.
         """
         holder = message
         *steps, (name, last) = self._steps

@@ -34,7 +34,7 @@ from std_msgs.msg import Empty, Float64MultiArray, Header, String
 from diffdrive_jacobian.messages import cdr
 from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError, Reader, Writer
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.structure import defined
+from diffdrive_jacobian.messages.structure import Number, Structure, Text
 
 CLASSES = (
     *(ParameterDescriptor, ParameterEvent),
@@ -366,7 +366,7 @@ def test_a_field_that_cannot_be_read_is_an_error():
         with pytest.raises(ValueError, match='a field of Odometry must be'):
             Reader(Odometry, [wrong])
     with pytest.raises(TypeError, match=r'a_msgs/One.text must not be a wide string'):
-        Reader(defined('a_msgs/msg/One', 'int8 number\nwstring text\n'), ['number'])
+        Reader(Structure('a_msgs/One', (('number', Number('b')), ('text', Text(wide=True)))), ['number'])
 
 
 # --- Writing
