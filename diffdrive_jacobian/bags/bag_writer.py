@@ -40,20 +40,19 @@ _DATA_END = 9 + 4
 """Size of the record that ends the data section and has its checksum."""
 MAX_SQLITE_PATH = 504
 """Length of the longest resolved path that SQLite opens (bytes)."""
-BAG_SUFFIXES = ('.mcap', '.db3', '.zstd', '.db3-shm', '.db3-wal', '.db3-journal')
+_BAG_SUFFIXES = ('.mcap', '.db3', '.zstd', '.db3-shm', '.db3-wal', '.db3-journal')
 """Endings of the files of a bag besides metadata.yaml."""
-REMAINDER = 10_000
+_REMAINDER = 10_000
 """Length of metadata.yaml without its topics and custom data, at most (characters)."""
-ESCAPED = 20
+_ESCAPED = 20
 """Length in YAML of a character, with its share of indentation, at most."""
 _SUM = (1 << 64) - 1
 
 
-class CheckedMcapWriter(McapWriter):
+class _CheckedMcapWriter(McapWriter):
     """rosbags' writer, with checksums of chunks, data section and summary (mcap.dev/spec)."""
 
     def close_chunk(self) -> None:
-        """Write the pending chunk."""
         place = self.bio.tell() + _CHUNK_CHECKSUM
         checksum = zlib.crc32(self.chunk.bio.getbuffer())
         super().close_chunk()
@@ -63,7 +62,6 @@ class CheckedMcapWriter(McapWriter):
         self.bio.seek(end)
 
     def close(self, version: int, metadata: str) -> None:
-        """Write the last chunk, the metadata and the summary, and close the file."""
         super().close(version, metadata)
         with open(self.path, 'r+b') as file:
             footer = file.seek(-mcap.FOOTER_END.size, 2)
@@ -78,16 +76,13 @@ class CheckedMcapWriter(McapWriter):
         file.write(struct.pack('<I', checksum))
 
 
-class PathSqlite3Writer(Sqlite3Writer):
+class _SqliteWriter(Sqlite3Writer):
     """rosbags' writer, which opens its file by the path and not by a URI.
 
     In the URI `file:PATH` of rosbags `#`, `?` and `%` have a meaning: it would write another file.
     """
 
     def __init__(self, path: Path, compression: CompressionMode) -> None:
-        """Create the file, named after the bag's directory."""
-        if compression == CompressionMode.STORAGE:
-            raise ValueError('SQLite files cannot be compressed as a whole while they are written')
         self.path = path.absolute() / f'{path.name}.db3'
         self.conn = sqlite3.connect(self.path)
         try:
@@ -106,8 +101,8 @@ class BagWriter(Writer):
     """rosbags' writer with these formats."""
 
     STORAGE_PLUGINS: Mapping[StoragePlugin, type[StorageWriter]] = {
-        StoragePlugin.MCAP: CheckedMcapWriter,
-        StoragePlugin.SQLITE3: PathSqlite3Writer,
+        StoragePlugin.MCAP: _CheckedMcapWriter,
+        StoragePlugin.SQLITE3: _SqliteWriter,
     }
 
 
@@ -161,7 +156,7 @@ def _is_nothing_but_a_bag(path: Path) -> bool:
     files = [] if path.is_symlink() or not path.is_dir() else list(path.iterdir())
     return bool(files) and all(
         file.is_file()
-        and (file.name == 'metadata.yaml' or file.suffix in BAG_SUFFIXES)
+        and (file.name == 'metadata.yaml' or file.suffix in _BAG_SUFFIXES)
         and not is_journal(file)
         for file in files
     )
@@ -219,25 +214,24 @@ def build_bag(
 
 
 @dataclass(slots=True)
-class Content:
+class _Content:
     """Counts and checksums of messages by topic, which do not depend on the order."""
 
     counts: Counter[str] = field(default_factory=Counter)
     checksums: Counter[str] = field(default_factory=Counter)
 
     def add(self, topic: str, stamp: int, data: bytes | memoryview) -> None:
-        """Count a message and add its checksum to that of its topic."""
         self.counts[topic] += 1
         self.checksums[topic] += (zlib.crc32(data) * 0x9E3779B97F4A7C15 + stamp) & _SUM
 
 
 def _write(
     records: Iterable[Record], channels: dict[int, Channel], path: Path, storage: str, compressed: bool
-) -> tuple[Summary, Content]:
+) -> tuple[Summary, _Content]:
     writer = BagWriter(path, version=9, storage_plugin=STORAGES[storage])
     if compressed:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    content = Content()
+    content = _Content()
     try:
         writer.open()
         connections = {
@@ -310,10 +304,10 @@ def _too_large(texts: dict[str, str], connections: Iterable[Connection]) -> list
         for one in connections
         if isinstance(one.ext, ConnectionExtRosbag2)
     ]
-    if ESCAPED * (len(str(topics)) + sum(map(len, texts.values()))) + REMAINDER <= MAX_SIZE:
+    if _ESCAPED * (len(str(topics)) + sum(map(len, texts.values()))) + _REMAINDER <= MAX_SIZE:
         return []
     sizes = {key: _yaml_size({key: value}) for key, value in texts.items()}
-    excess = REMAINDER + _yaml_size(topics) + sum(sizes.values()) - MAX_SIZE
+    excess = _REMAINDER + _yaml_size(topics) + sum(sizes.values()) - MAX_SIZE
     largest = []
     for key in sorted(sizes, key=sizes.__getitem__, reverse=True):
         if excess <= 0:
@@ -332,9 +326,9 @@ def _yaml_size(content: object) -> int:
     return len(stream.getvalue())
 
 
-def _contents(path: Path) -> Content:
+def _contents(path: Path) -> _Content:
     """Read a whole bag with the limits of all readers, or raise OSError."""
-    content = Content()
+    content = _Content()
     try:
         with open_bag(path) as reader:
             for connection, stamp, data in messages(reader, reader.connections):

@@ -52,6 +52,9 @@ UNPACK_ERRORS = (ValueError, RuntimeError, EOFError, zstd.ZstdError)
 """What unpacking raises on damaged or too large data."""
 _BLOCK = 1 << 20
 _MAX_FRAMES = 1000
+Messages = Generator[tuple[Connection, int, bytes], None, None]
+MAX_KNOWN = 10_000
+"""Length of texts with profiles whose values are stored (characters)."""
 
 
 def check_record(size: int, what: str) -> None:
@@ -159,12 +162,7 @@ def unpack_file(path: Path, out: BinaryIO | None, budget: Budget | None = None) 
                     out.write(block)
 
 
-Messages = Generator[tuple[Connection, int, bytes], None, None]
-
-MAX_KNOWN = 10_000
-"""Length of texts with profiles whose values are stored (characters)."""
-
-# --- Replacements of functions of rosbags' modules
+# --- Functions of rosbags' modules
 
 
 def parse_bounded_qos(profiles: Any) -> list[Qos]:

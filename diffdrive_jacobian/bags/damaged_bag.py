@@ -54,6 +54,10 @@ from diffdrive_jacobian.text import printable
 MAX_DEFINITION = 200_000
 """Length of the longest definition of a type that is parsed; those of ROS have less than a tenth."""
 _PARSE_ERRORS = (TypesysError, LookupError, ValueError, AssertionError, RecursionError)
+READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}
+ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+LAST_ENCAPSULATION = 0x0B
+"""Of CDR, in the second byte of a message; the first one is 0."""
 
 
 def definition_and_hash(topic: Topic) -> tuple[str, str]:
@@ -107,12 +111,6 @@ def _hash(text: str, type_name: str) -> str:
     store = get_typestore(Stores.EMPTY)
     store.fielddefs.update(get_types_from_msg(text, type_name))
     return store.hash_rihs01(type_name)
-
-
-READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}
-ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
-LAST_ENCAPSULATION = 0x0B
-"""Of CDR, in the second byte of a message; the first one is 0."""
 
 
 class DamagedBag:

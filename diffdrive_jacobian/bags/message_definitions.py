@@ -45,6 +45,12 @@ _NUMBERS = {'bool': 'boolean', 'byte': 'octet', 'char': 'uint8', 'float32': 'flo
 _NONE = 'structure_needs_at_least_one_member'
 """The only field of a message without fields, as rosbags has it."""
 _HASH = re.compile('RIHS01_[0-9a-f]{64}')
+DELIMITER = '=' * 80
+_NAME = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9_]*)')
+_LIBRARIES = (('lib',), ('lib64',), ('local', 'lib'), ('Lib',))
+"""Directories of Python packages, relative to a prefix."""
+_FIELD = re.compile(r'^\s*([A-Za-z]\w*(?:/[A-Za-z]\w*)?)(?:<=\d+)?(?:\[[^]]*\])?\s+[A-Za-z]\w*')
+_PRIMITIVE = re.compile(r'bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string')
 
 
 @cache
@@ -134,14 +140,6 @@ def type_hashes(connection: Connection, stored: Iterable[Connection]) -> list[st
     """Return the hashes of a topic's type in metadata.yaml and in the data files (`stored`)."""
     alike = (one for one in stored if (one.topic, one.msgtype) == (connection.topic, connection.msgtype))
     return [str(one.digest) for one in (connection, *alike)]
-
-
-DELIMITER = '=' * 80
-_NAME = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9_]*)')
-_LIBRARIES = (('lib',), ('lib64',), ('local', 'lib'), ('Lib',))
-"""Directories of Python packages, relative to a prefix."""
-_FIELD = re.compile(r'^\s*([A-Za-z]\w*(?:/[A-Za-z]\w*)?)(?:<=\d+)?(?:\[[^]]*\])?\s+[A-Za-z]\w*')
-_PRIMITIVE = re.compile(r'bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string')
 
 
 class UnknownTypeError(DiffdriveError):

@@ -38,6 +38,8 @@ from diffdrive_jacobian.text import printable
 
 Decoder = Callable[[bytes], Any]
 """Decodes a message, or raises DecodingError."""
+RECOVERED = '_recovered'
+"""Ends the name of a recovered bag."""
 
 
 def _decoder(channel: Channel) -> Decoder | None:
@@ -49,10 +51,6 @@ def _decoder(channel: Channel) -> Decoder | None:
             if known(name).type_hash == channel.type_hash:
                 return Reader(types(name), (), bounded=False)
     return None
-
-
-RECOVERED = '_recovered'
-"""Ends the name of a recovered bag."""
 
 
 class NothingToSaveError(DiffdriveError):

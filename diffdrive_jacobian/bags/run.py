@@ -20,7 +20,6 @@ from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bag_reader import (
     BagError,
-    DamagedBagError,
     ReadingInterruptedError,
     messages,
     open_bag,
@@ -46,6 +45,8 @@ COLUMNS = {topic.series: topic.columns for topic in TOPICS.values() if topic.ser
 """Columns of the values of each series of a `Run`."""
 _CONTROLLER = {'controller', 'use_goal_heading', 'xy_goal_tolerance'}
 """Parameters by which a go_to_goal of another name is known."""
+WHEELS = ('left_wheel_joint', 'right_wheel_joint')
+"""Names of the left and the right wheel joint where no parameters give them."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, repr=False)
@@ -171,19 +172,7 @@ def number(value: object) -> float:
     return float(value)
 
 
-__all__ = [
-    'BagError',
-    'DamagedBagError',
-    'ReadingInterruptedError',
-    'Run',
-    'Series',
-    'messages',
-    'open_bag',
-    'read_run',
-]
-
-WHEELS = ('left_wheel_joint', 'right_wheel_joint')
-"""Names of the left and the right wheel joint where no parameters give them."""
+# --- Reading
 
 
 def read_run(

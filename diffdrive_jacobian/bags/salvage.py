@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple
 
@@ -21,8 +22,6 @@ from diffdrive_jacobian.bags.journal import CUSTOM_DATA, LIBRARY, Message, Text
 from diffdrive_jacobian.text import format_size
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-Schemas = dict[int, tuple[str, str]]
-"""Numbers of types to their names and definitions."""
 Note = Callable[[str], None]
 """Is called with a description of a loss, or of what cannot be checked."""
 
@@ -44,12 +43,17 @@ Found = Topic | Message | Text | str
 """A `str` is a copy of metadata.yaml in the file."""
 
 
-class _Check:
-    """Compares the messages that were found with the checksums and counts of the file."""
+# --- MCAP
+
+
+class _McapFile:
+    """Reads an MCAP file, and compares what is found with the checksums and counts in it."""
 
     def __init__(self, file: BinaryIO, note: Note, doubt: Note) -> None:
         self._file = file
         self._note, self._doubt = note, doubt
+        self._schemas: dict[int, tuple[str, str]] = {}
+        """Numbers of types to their names and definitions."""
         self._found: Counter[int] = Counter()
         self._counts: dict[int, int] | None = None
         self._topics: dict[int, Topic] = {}
@@ -60,17 +64,89 @@ class _Check:
         # Only the last of each kind counts, so that each part of the file is read once.
         self._checksums: dict[str, tuple[int, int, int]] = {}
 
-    def add(self, found: Found, checked: bool) -> None:
-        """Count what was found; `checked`: in a chunk with a checksum."""
-        if isinstance(found, Message):
-            self._found[found.channel] += 1
-            self._behind += not self._in_data
-            self._last = max(self._last, found.number)
-        elif isinstance(found, Topic):
-            self._differing += self._topics.setdefault(found.id, found) != found
-        self._unchecked |= self._in_data and not checked and isinstance(found, Topic | Message)
+    def read(self) -> Iterator[Found]:
+        size = self._file.seek(0, 2)
+        self._file.seek(0)
+        if self._file.read(len(mcap.MAGIC)) != mcap.MAGIC:
+            self._note(f'its {size} bytes are not the start of an MCAP file')
+            return
+        self._budget = Budget(size)
+        good, opcode = len(mcap.MAGIC), 0
+        # Where a record is invalid, the position of the next one is unknown.
+        with suppress(ValueError):
+            for opcode, payload, end in _walk(self._file, size, self._note):
+                if opcode == mcap.CHUNK:
+                    yield from self._chunk(payload, end > size)
+                elif end <= size:
+                    yield from self._record(opcode, payload, checked=False)
+                    self._check(opcode, payload, end)
+                if end <= size:
+                    good = end
+        self._file.seek(good)
+        if good == size and opcode != mcap.FOOTER:
+            self._doubt('it has no end: what its writer had not written yet is not in it')
+        elif opcode != mcap.FOOTER or self._file.read(len(mcap.MAGIC) + 1) != mcap.MAGIC:
+            lost = f'the last {size - good} of its {size} bytes are not a complete record'
+            self._note(f'it is cut off: {lost}')
+        self._finish()
 
-    def add_record(self, opcode: int, payload: bytes, end: int) -> None:
+    def _chunk(self, payload: bytes, cut: bool) -> Iterator[Found]:
+        cursor = mcap.Cursor(payload)
+        try:
+            start, end, size, checksum = (cursor.number(length) for length in (8, 8, 8, 4))
+            compression, length = cursor.text(), cursor.number(8)
+            check_record(size, 'it')
+            self._budget.spend(size)
+            data = unpack(compression, cursor.left[:length], size)
+        except UNPACK_ERRORS as error:
+            self._note(f'a chunk of {len(payload)} bytes cannot be unpacked: {error}')
+            return
+        right = len(data) == size and checksum in (0, zlib.crc32(data))
+        if not cut and not right:
+            what = f'a chunk of {size} bytes ({(end - start) / NANOSECONDS:.1f} s)'
+            self._note(f'{what} is damaged: its messages may be altered')
+        good = 0
+        with suppress(ValueError):
+            for opcode, record, ending in _walk(BytesIO(data), len(data), self._note):
+                if ending <= len(data):
+                    yield from self._record(opcode, record, checked=checksum != 0)
+                    good = ending
+        if good < len(data) and not cut:
+            lost = f'the last {len(data) - good} of the {size} bytes of a chunk'
+            self._note(f'{lost} are not complete records')
+
+    def _record(self, opcode: int, payload: bytes, *, checked: bool) -> Iterator[Found]:
+        """Read a complete record, or raise ValueError; `checked`: in a chunk with a checksum."""
+        cursor = mcap.Cursor(payload)
+        if opcode == mcap.MESSAGE:
+            channel, number, stamp, _ = mcap.MESSAGE_HEAD.unpack(cursor.take(mcap.MESSAGE_HEAD.size))
+            self._found[channel] += 1
+            self._behind += not self._in_data
+            self._last = max(self._last, number)
+            self._unchecked |= self._in_data and not checked
+            yield Message(channel, stamp, cursor.left, number)
+        elif opcode == mcap.SCHEMA:
+            number, name, _ = cursor.number(2), cursor.text(), cursor.text()
+            self._schemas[number] = name, cursor.text()
+        elif opcode == mcap.CHANNEL:
+            number, schema = cursor.number(2), cursor.number(2)
+            name, encoding, extra = cursor.text(), cursor.text(), cursor.texts()
+            type_name, definition = self._schemas.get(schema, ('', ''))
+            qos, type_hash = (extra.get(key, '') for key in ('offered_qos_profiles', 'topic_type_hash'))
+            topic = Topic(number, name, type_name, encoding, qos, type_hash, definition)
+            self._differing += self._topics.setdefault(number, topic) != topic
+            self._unchecked |= self._in_data and not checked
+            yield topic
+        elif opcode == mcap.ATTACHMENT and payload[-4:] == _checksum(payload[:-4]):
+            # Its times.
+            cursor.take(16)
+            key, media_type = cursor.text(), cursor.text()
+            if media_type == CUSTOM_DATA:
+                yield Text(key, cursor.take(cursor.number(8)).decode())
+        elif opcode == mcap.METADATA and cursor.text() == 'rosbag2':
+            yield cursor.texts().get('serialized_metadata', '')
+
+    def _check(self, opcode: int, payload: bytes, end: int) -> None:
         """Take the counts and checksums from a record, or raise ValueError if it is invalid."""
         cursor, start = mcap.Cursor(payload), end - len(payload) - mcap.HEAD.size
         if self._numbered and self._in_data and opcode not in (mcap.ATTACHMENT, mcap.DATA_END):
@@ -95,7 +171,7 @@ class _Check:
             summary, _, checksum = (cursor.number(length) for length in (8, 8, 4))
             self._checksums['summary'] = summary or start, end - 4, checksum
 
-    def finish(self) -> None:
+    def _finish(self) -> None:
         """Report what differs, and what cannot be checked."""
         for what, (start, end, checksum) in self._checksums.items():
             right = checksum != 0 and mcap.file_checksum(self._file, start, end) == checksum
@@ -121,41 +197,14 @@ class _Check:
 
 
 def read_mcap(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
-    """Read an MCAP file up to its end, or up to where it is cut off or damaged.
+    """Yield what is in an MCAP file (mcap.dev/spec) up to its end, or where it is cut off or damaged.
 
     Args:
         file: The file.
         note: Is called with a description of each loss.
         doubt: Is called with what cannot be checked.
     """
-    size = file.seek(0, 2)
-    file.seek(0)
-    if file.read(len(mcap.MAGIC)) != mcap.MAGIC:
-        note(f'its {size} bytes are not the start of an MCAP file')
-        return
-    schemas: Schemas = {}
-    budget, check = Budget(size), _Check(file, note, doubt)
-    good, opcode = len(mcap.MAGIC), 0
-    try:
-        for opcode, payload, end in _walk(file, size, note):
-            if opcode == mcap.CHUNK:
-                yield from _read_chunk(payload, end > size, schemas, budget, check, note)
-            elif end <= size:
-                for found in _read_record(opcode, payload, schemas):
-                    check.add(found, False)
-                    yield found
-                check.add_record(opcode, payload, end)
-            if end <= size:
-                good = end
-    except ValueError:
-        # A record is invalid, so the position of the next one is unknown.
-        pass
-    file.seek(good)
-    if good == size and opcode != mcap.FOOTER:
-        doubt('it has no end: what its writer had not written yet is not in it')
-    elif opcode != mcap.FOOTER or file.read(len(mcap.MAGIC) + 1) != mcap.MAGIC:
-        note(f'it is cut off: the last {size - good} of its {size} bytes are not a complete record')
-    check.finish()
+    return _McapFile(file, note, doubt).read()
 
 
 def _walk(file: BinaryIO, size: int, note: Note) -> Iterator[tuple[int, bytes, int]]:
@@ -185,66 +234,11 @@ def _walk(file: BinaryIO, size: int, note: Note) -> Iterator[tuple[int, bytes, i
     yield from waiting
 
 
-def _read_chunk(
-    payload: bytes, cut: bool, schemas: Schemas, budget: Budget, check: _Check, note: Note
-) -> Iterator[Found]:
-    cursor = mcap.Cursor(payload)
-    try:
-        start, end, size, checksum = (cursor.number(length) for length in (8, 8, 8, 4))
-        compression, length = cursor.text(), cursor.number(8)
-        check_record(size, 'it')
-        budget.spend(size)
-        data = unpack(compression, cursor.left[:length], size)
-    except UNPACK_ERRORS as error:
-        note(f'a chunk of {len(payload)} bytes cannot be unpacked: {error}')
-        return
-    right = len(data) == size and checksum in (0, zlib.crc32(data))
-    if not cut and not right:
-        seconds = (end - start) / NANOSECONDS
-        note(f'a chunk of {size} bytes ({seconds:.1f} s) is damaged: its messages may be altered')
-    good = 0
-    try:
-        for opcode, record, ending in _walk(BytesIO(data), len(data), note):
-            if ending <= len(data):
-                for found in _read_record(opcode, record, schemas):
-                    check.add(found, checksum != 0)
-                    yield found
-                good = ending
-    except ValueError:
-        # As in read_mcap.
-        pass
-    if good < len(data) and not cut:
-        note(f'the last {len(data) - good} of the {size} bytes of a chunk are not complete records')
-
-
 def _checksum(content: bytes) -> bytes:
     return mcap.number(zlib.crc32(content), 4)
 
 
-def _read_record(opcode: int, payload: bytes, schemas: Schemas) -> Iterator[Found]:
-    """Read a complete record, or raise ValueError if it is invalid."""
-    cursor = mcap.Cursor(payload)
-    if opcode == mcap.MESSAGE:
-        channel, number, stamp, _ = mcap.MESSAGE_HEAD.unpack(cursor.take(mcap.MESSAGE_HEAD.size))
-        yield Message(channel, stamp, cursor.left, number)
-    elif opcode == mcap.SCHEMA:
-        number, name, _ = cursor.number(2), cursor.text(), cursor.text()
-        schemas[number] = name, cursor.text()
-    elif opcode == mcap.CHANNEL:
-        number, schema = cursor.number(2), cursor.number(2)
-        name, encoding, extra = cursor.text(), cursor.text(), cursor.texts()
-        type_name, definition = schemas.get(schema, ('', ''))
-        qos, type_hash = (extra.get(key, '') for key in ('offered_qos_profiles', 'topic_type_hash'))
-        yield Topic(number, name, type_name, encoding, qos, type_hash, definition)
-    elif opcode == mcap.ATTACHMENT and payload[-4:] == _checksum(payload[:-4]):
-        # Its times.
-        cursor.take(16)
-        key, media_type = cursor.text(), cursor.text()
-        if media_type == CUSTOM_DATA:
-            yield Text(key, cursor.take(cursor.number(8)).decode())
-    elif opcode == mcap.METADATA and cursor.text() == 'rosbag2':
-        yield cursor.texts().get('serialized_metadata', '')
-
+# --- SQLite
 
 _LEAF = 0x0D
 _WIDTHS = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)  # of the serial types below 10
@@ -372,12 +366,10 @@ def _values(record: bytes) -> list[Any]:
 
 
 def read_sqlite(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
-    """Read an SQLite file of rosbag2, including rows that were not committed, in their order.
+    """Yield what is in an SQLite file of rosbag2 (sqlite.org/fileformat2.html), as `read_mcap`.
 
-    Args:
-        file: The file.
-        note: Is called with a description of each loss.
-        doubt: Is called with what cannot be checked.
+    It is read by its leaf pages, since the tree above them may be missing or out of date. So rows are
+    found, in their order, that were written but not committed.
     """
     doubt('SQLite has no checksums, so altered messages cannot be noticed')
     pages = _Pages(file)

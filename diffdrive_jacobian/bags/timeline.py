@@ -405,6 +405,8 @@ def tolerance(run: Run) -> float:
     return run.number_of_node('go_to_goal', 'xy_goal_tolerance', default)
 
 
+# --- Lines
+
 BUCKETS = 1500
 """A longer line is reduced to the minimum and the maximum of so many parts."""
 _TWIST = {'v': 0, 'omega': 1}

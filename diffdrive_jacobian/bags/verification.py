@@ -22,7 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.run import BagError, ReadingInterruptedError, Run, Series
+from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
+from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
 from diffdrive_jacobian.numerics.elementary import wrap
@@ -32,6 +33,35 @@ from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.time_units import NANOSECONDS
+
+ROBOT = 'virtual_robot'
+EXACT, BY_RECORDING_TIME = 1e-9, 0.02
+"""Default tolerances, with `cmd_vel_out` and with commands by their time of recording (m, rad)."""
+COVARIANCE_TOLERANCE = 1e-9
+"""Largest allowed difference of a covariance, relative to the standard deviations."""
+_MAX_CANDIDATES = 32
+"""Largest number of commands among which the last one that preceded an odometry message is sought."""
+_MAX_DELAY = 1.0
+"""Beyond this delay of the odometry (median) its stamps and the recorder are of different clocks (s)."""
+_NOISE_PARAMETERS = ('wheel_separation', 'wheel_travel_variance')
+_NUMBER = r'(\d+(?:\.\d+)?(?:e[+-]?\d+)?)'
+_MOTOR_FAULTS: tuple[tuple[re.Pattern[str], Callable[..., Actuators]], ...] = (
+    (
+        re.compile(rf'ActuatorLag\({_NUMBER}'),
+        lambda actuators, seconds: actuators.lagging(float(seconds)),
+    ),
+    (
+        re.compile(r"DeadWheel\('(left|right)'"),
+        lambda actuators, wheel: actuators.weakened(wheel, 0.0),
+    ),
+    (
+        re.compile(rf"SaturatedWheel\('(left|right)', {_NUMBER}"),
+        lambda actuators, wheel, speed: actuators.weakened(wheel, float(speed)),
+    ),
+)
+"""Faults that change how a robot follows commands, and how its actuators change."""
+_FAULTY_ROBOT = re.compile(r"robot='([^']*)'")
+_NEVER = int(np.iinfo(np.int64).max)
 
 
 class TruthDifferences(NamedTuple):
@@ -70,36 +100,6 @@ def placed_as_recorded(run: Run, placed: tuple[Robot, Robot]) -> Robot:
         return float(np.hypot(*(robot.at(stamp).true_pose[:2] - place)))
 
     return min(placed, key=apart)
-
-
-ROBOT = 'virtual_robot'
-EXACT, BY_RECORDING_TIME = 1e-9, 0.02
-"""Default tolerances, with `cmd_vel_out` and with commands by their time of recording (m, rad)."""
-COVARIANCE_TOLERANCE = 1e-9
-"""Largest allowed difference of a covariance, relative to the standard deviations."""
-_MAX_CANDIDATES = 32
-"""Largest number of commands among which the last one that preceded an odometry message is sought."""
-_MAX_DELAY = 1.0
-"""Beyond this delay of the odometry (median) its stamps and the recorder are of different clocks (s)."""
-_NOISE_PARAMETERS = ('wheel_separation', 'wheel_travel_variance')
-_NUMBER = r'(\d+(?:\.\d+)?(?:e[+-]?\d+)?)'
-_MOTOR_FAULTS: tuple[tuple[re.Pattern[str], Callable[..., Actuators]], ...] = (
-    (
-        re.compile(rf'ActuatorLag\({_NUMBER}'),
-        lambda actuators, seconds: actuators.lagging(float(seconds)),
-    ),
-    (
-        re.compile(r"DeadWheel\('(left|right)'"),
-        lambda actuators, wheel: actuators.weakened(wheel, 0.0),
-    ),
-    (
-        re.compile(rf"SaturatedWheel\('(left|right)', {_NUMBER}"),
-        lambda actuators, wheel, speed: actuators.weakened(wheel, float(speed)),
-    ),
-)
-"""Faults that change how a robot follows commands, and how its actuators change."""
-_FAULTY_ROBOT = re.compile(r"robot='([^']*)'")
-_NEVER = int(np.iinfo(np.int64).max)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

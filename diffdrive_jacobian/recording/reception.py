@@ -31,6 +31,8 @@ from diffdrive_jacobian.ros.rclpy_internals import (
 
 MAX_RUNS = 100
 """Runs of consecutive numbers that are kept of each publisher, to recognize messages received twice."""
+BURST = 1000
+"""Largest number of messages that are taken from a queue at once."""
 
 
 class _Publisher:
@@ -112,10 +114,6 @@ class MissedMessages:
         # The time, too, tells the messages of a publisher apart.
         self._numbered = False
         return message.sent
-
-
-BURST = 1000
-"""Largest number of messages that are taken from a queue at once."""
 
 
 class CallbackReception:

@@ -45,6 +45,10 @@ CAPACITY = 128 << 20
 """Memory for records that wait to be written (bytes): four seconds of 1 MB at 30 Hz."""
 EARLY = 4 << 20
 """Waiting records of this size are written before the period is over (bytes)."""
+MAX_REASON = 500
+"""Largest length of the report on a topic that was left out (characters)."""
+MAX_LEFT_OUT = 100
+"""Largest number of topics that were left out and are named."""
 
 
 class JournalThread:
@@ -137,13 +141,6 @@ class JournalThread:
                 self._changed.notify_all()
             if closing:
                 return
-
-
-MAX_REASON = 500
-"""Largest length of the report on a topic that was left out (characters)."""
-
-MAX_LEFT_OUT = 100
-"""Largest number of topics that were left out and are named."""
 
 
 class RecordingError(DiffdriveError):

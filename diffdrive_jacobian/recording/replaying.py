@@ -52,6 +52,12 @@ COMMANDS = ('cmd_vel',)
 """Topics of the commands to a robot."""
 GOALS = ('goal_pose', 'goals')
 """Topics of the goals of its controller."""
+DEPTH = 1000
+DISCOVERY_PATIENCE = 5.0
+"""Default of the longest wait for subscriptions where no number is required (s): an older participant
+is announced every 3 s."""
+MATCH_QUIET = 0.5
+"""Time for which the numbers of subscriptions must not have changed before playback starts (s)."""
 
 
 class NothingToPlayError(BagError):
@@ -187,7 +193,7 @@ def _resolved(name: str, there: Sequence[str], reader: Reader) -> str:
     return found[0]
 
 
-DEPTH = 1000
+# --- The node
 
 
 class Replayer(Node):  # type: ignore[misc]
@@ -371,11 +377,7 @@ def _messages_from(
     return (one for one in messages(reader, connections) if one[1] >= start)
 
 
-DISCOVERY_PATIENCE = 5.0
-"""Default of the longest wait for subscriptions where no number is required (s): an older participant
-is announced every 3 s."""
-MATCH_QUIET = 0.5
-"""Time for which the numbers of subscriptions must not have changed before playback starts (s)."""
+# --- The stages of a replay
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -237,7 +237,8 @@ def _picture(recording: Recording) -> Path:
 
 def _save(recording: Recording, *, plot: bool, replace: bool) -> int:
     """Write the bag and its picture, and print their names; return the exit code."""
-    from diffdrive_jacobian.bags.run import BagError, read_run
+    from diffdrive_jacobian.bags.bag_reader import BagError
+    from diffdrive_jacobian.bags.run import read_run
     from diffdrive_jacobian.plots.run_figure import draw
     from diffdrive_jacobian.recording.recording import RecordingError
 

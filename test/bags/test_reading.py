@@ -14,6 +14,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from support.bags import REAL, SECOND, changed, odom, start, status, write_bag
+from support.raw_bags import channel
 from support.ros_messages import (
     goal,
     goals,
@@ -25,13 +26,13 @@ from support.ros_messages import (
 )
 from support.runs import built_run, sample, series
 
+from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.bags import run as run_module
 from diffdrive_jacobian.bags import timeline as timeline_module
 from diffdrive_jacobian.bags.bag_reader import ReadingInterruptedError
 from diffdrive_jacobian.bags.bag_writer import build_bag
-from diffdrive_jacobian.bags.journal import Channel, Message
-from diffdrive_jacobian.bags.message_definitions import definition, known_structure
-from diffdrive_jacobian.bags.run import BagError, read_run
+from diffdrive_jacobian.bags.journal import Message
+from diffdrive_jacobian.bags.message_definitions import known_structure
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import GOALS
@@ -232,13 +233,10 @@ def test_parameters_name_the_wheels(tmp_path):
 
 
 def test_messages_that_cannot_be_decoded_are_skipped_and_counted(tmp_path):
-    known = definition('nav_msgs/msg/Odometry')
-    channel = Channel(
-        id=0, topic='/odom', type_name=known.name, definition=known.text, type_hash=known.type_hash
-    )
     good = Message(0, SECOND, serialize_message(odom(1, 2, 0)))
     damaged = [Message(0, SECOND, data) for data in (b'', b'\x00\x01\x00\x00', b'\xff' * 300)]
-    build_bag([channel], [good, *damaged, good], tmp_path / 'bag', 'mcap')
+    records = [good, *damaged, good]
+    build_bag([channel(0, '/odom', 'nav_msgs/msg/Odometry')], records, tmp_path / 'bag', 'mcap')
     run = read_run(tmp_path / 'bag')
     assert run.odometry.values[:, 0].tolist() == [1.0, 1.0]
     assert run.skipped == {'/odom': 3}

@@ -14,11 +14,9 @@ from geometry_msgs.msg import (
     Point32,
     Polygon,
     PolygonStamped,
-    Pose,
     PoseStamped,
     PoseWithCovarianceStamped,
     Twist,
-    TwistStamped,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -38,7 +36,7 @@ from diffdrive_jacobian.messages.structure import Number, Structure, Text
 
 CLASSES = (
     *(ParameterDescriptor, ParameterEvent),
-    *(Odometry, Twist, TwistStamped, JointState, Clock, Pose, PoseStamped, PoseWithCovarianceStamped),
+    *(Odometry, Twist, JointState, Clock, PoseStamped, PoseWithCovarianceStamped),
     *(Goals, Float64MultiArray, GoalStatus),
 )
 by_class = pytest.mark.parametrize('message_class', CLASSES, ids=lambda one: one.__name__)

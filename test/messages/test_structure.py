@@ -46,8 +46,8 @@ def installed_types():
 def test_installed_types_are_the_same_by_their_classes_and_by_their_definitions():
     types = installed_types()
     assert len(types) > 100
-    # Each third: all of them take a second and a half.
-    for name, kind in sorted(types.items())[::3]:
+    # Not all: they take a second.
+    for name, kind in sorted(types.items())[::6]:
         assert installed_structure(name) == structure(kind), name
         if is_known(name) and known_definition(name).type_hash == definition(name).type_hash:
             assert known_structure(name) == structure(kind), name
