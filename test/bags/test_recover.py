@@ -42,8 +42,6 @@ from diffdrive_jacobian.bags import bounded_reader
 from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.bags.journal import Message, Text
 from diffdrive_jacobian.bags.mcap import CHUNK, DATA_END, FOOTER, METADATA, STATISTICS
-from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools.recover_run import main
 
 pytestmark = pytest.mark.usefixtures('quick_disk')
 
@@ -431,13 +429,6 @@ def test_output_that_exists_or_cannot_be_written(run, tmp_path, capsys):
         assert_refused(capsys, tmp_path, [run, '-o', place], 2, 'no bag was written')
 
 
-def test_wrong_arguments(capsys):
-    for arguments in ((), ('run', '-s', 'ros1'), ('run', '--nonsense')):
-        code, out, err = recover(capsys, *arguments)
-        assert (code, out) == (2, '')
-        assert 'recover_run: error: ' in err
-
-
 def test_topics_of_unknown_types_are_left_out(run, capsys):
     """The known ones are saved; the exit code reports that not all are."""
     file = write_without_metadata(run, 'sqlite3')
@@ -450,15 +441,6 @@ def test_topics_of_unknown_types_are_left_out(run, capsys):
     assert 'lost: /cmd_vel is left out: no installed package defines my_msgs/msg/Mine' in out
     assert read_bag(run.with_name('run_recovered')) == [one for one in MESSAGES if one[0] == '/odom']
     assert contents(run) == before
-
-
-def test_a_signal_leaves_no_bag(run, tmp_path, capsys):
-    write_without_metadata(run)
-    signals = Signals()
-    signals.count = 1
-    assert main([str(run)], signals) == 130
-    assert capsys.readouterr().err == 'recover_run: interrupted: no bag was written\n'
-    assert os.listdir(tmp_path) == ['run']
 
 
 def test_compressed_files_and_messages_are_unpacked(run, capsys):
