@@ -1,24 +1,27 @@
-"""The node that records: it receives topics as raw CDR and adds them to a recording."""
+"""The node that records topics as raw CDR, and a recording by it alone."""
 
 from __future__ import annotations
 
 import json
 import re
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from rosbags.interfaces import Qos
 
+from diffdrive_jacobian.bags.bag_writer import Summary
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.messages.names import full_name
+from diffdrive_jacobian.messages.topics import OF_EVERY_NODE
 from diffdrive_jacobian.messages.topics import Selection as Selection
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
@@ -27,13 +30,17 @@ from diffdrive_jacobian.recording.reception import (
     CountingReception,
     Intake,
 )
+from diffdrive_jacobian.recording.recording import Recording, saved_on_error
+from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.qos import to_rosbags
+from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage, reason
+from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 
-if TYPE_CHECKING:
-    from diffdrive_jacobian.recording.recording import Recording
-
+NAME = 'record_run'
+"""Name of the node."""
 DEPTH = 4000
 """Depth of the queue of each subscription."""
 DRAIN_PATIENCE = 12.0
@@ -57,6 +64,10 @@ OVERHEAD = 768
 """What a message takes up in the buffer of a socket besides its data (bytes)."""
 MAX_REPORT = 500
 """Largest length of the report on a topic (characters)."""
+DISCOVERY_PERIOD = 0.2
+"""Time between two searches for new topics (s)."""
+WAIT_SHOWN = 0.5
+"""A wait for late messages that is longer than this is shown (s)."""
 
 
 class Recorder(Node):  # type: ignore[misc]
@@ -87,7 +98,7 @@ class Recorder(Node):  # type: ignore[misc]
         Raises:
             ParameterError: The name of a topic is invalid.
         """
-        super().__init__('record_run', start_parameter_services=False, **kwargs)
+        super().__init__(NAME, start_parameter_services=False, **kwargs)
         self._sink = sink
         self._everything = selection.everything
         self._names = {self._resolved(topic) for topic in selection.topics}
@@ -331,3 +342,120 @@ class Recorder(Node):  # type: ignore[misc]
 def _profiles(publishers: list[Any]) -> tuple[Qos, ...]:
     """Return the distinct offered QoS profiles."""
     return tuple(dict.fromkeys(to_rosbags(one.qos_profile) for one in publishers))
+
+
+# --- A recording by this node alone
+
+
+class Status(NamedTuple):
+    """The state of a recording."""
+
+    messages: int
+    """Number of messages received."""
+    topics: int
+    """Number of topics."""
+    size: int
+    """Size of the journal (bytes)."""
+    seconds: float
+    """Time since the start (s)."""
+    lost: int
+    """Number of messages that are known to be lost."""
+    missing: tuple[str, ...] = ()
+    """Topics that were selected by name and had no publisher so far, fully qualified."""
+    published: tuple[str, ...] = ()
+    """Topics of other nodes that have a publisher, if no topic is recorded. For messages."""
+
+
+def record(
+    recording: Recording,
+    selection: Selection,
+    *,
+    max_duration: float | None,
+    ros_arguments: Sequence[str],
+    signals: Signals,
+    on_status: Callable[[Status], object],
+    on_wait: Callable[[Sequence[str]], object],
+    on_end: Callable[[], object],
+) -> Summary:
+    """Record until a signal is caught, the time is over, ROS is shut down or the disk fails.
+
+    Args:
+        recording: Where to record. It is finished, or discarded on a `UserError`.
+        selection: Which topics.
+        max_duration: Longest duration (s). None: no limit.
+        ros_arguments: ROS arguments of the node.
+        signals: Counter of the signals that end the recording.
+        on_status: Receives the status, several times a second.
+        on_wait: Called if late messages are waited for at the end, with their topics.
+        on_end: Called when nothing more is received, before the bag is written.
+
+    Returns:
+        What the bag contains.
+
+    Raises:
+        UserError: The ROS arguments are invalid.
+        RecordingError: The recording is not complete.
+    """
+    if not signals.count:
+        with (
+            saved_on_error(recording),
+            ros_context([NAME, *ros_arguments]) as context,
+            running(context, isolated=False, with_info=True) as runner,
+        ):
+            recorder = runner.add(
+                lambda: Recorder(selection, recording, with_info=True, context=context)
+            )
+            discovery = TokenBucket(1, DISCOVERY_PERIOD)
+
+            def failed() -> bool:
+                if discovery.permits(time.monotonic()):
+                    recorder.discover()
+                    on_status(_status(recorder, recording))
+                return recording.error is not None
+
+            left = inf if max_duration is None else recording.started + max_duration - time.monotonic()
+            if not runner.spin(failed, timeout=left, signals=signals) and context.ok():
+                _drain(recorder, runner, signals, on_wait)
+    on_end()
+    return recording.finish()
+
+
+def _drain(
+    recorder: Recorder,
+    runner: NodeRunner,
+    signals: Signals,
+    on_wait: Callable[[Sequence[str]], object],
+) -> None:
+    """Receive what was sent before now, until a further signal."""
+    recorder.end()
+    before = signals.count
+    drained = runner.spin(recorder.drained, timeout=WAIT_SHOWN, signals=signals, handled=before)
+    if not drained:
+        if recorder.awaited and signals.count == before:
+            on_wait(recorder.awaited)
+        drained = runner.spin(recorder.drained, signals=signals, handled=before)
+    if not drained and signals.count > before:
+        recorder.give_up('a second signal ended the wait for late messages')
+
+
+def _status(recorder: Recorder, recording: Recording) -> Status:
+    return Status(
+        messages=recorder.messages,
+        topics=len(recorder.topics),
+        size=recording.journal.size,
+        seconds=time.monotonic() - recording.started,
+        lost=sum(recording.lost.values()),
+        missing=tuple(recorder.missing),
+        published=() if recorder.topics else tuple(_published(recorder)),
+    )
+
+
+def _published(node: Node) -> list[str]:
+    """Return the topics that have a publisher. Those that every node publishes are left out."""
+    found = []
+    for topic, _ in sorted(node.get_topic_names_and_types()):
+        # A DDS application without ROS can use any name.
+        with suppress(ValueError, NameValidationException):
+            if topic not in OF_EVERY_NODE and node.count_publishers(topic):
+                found.append(topic)
+    return found

@@ -7,7 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -33,7 +33,7 @@ from diffdrive_jacobian.bags.journal import (
     Text,
 )
 from diffdrive_jacobian.bags.salvage import Topic, read_mcap
-from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.errors import DiffdriveError, UserError
 from diffdrive_jacobian.plots.output_files import names_by_time
 from diffdrive_jacobian.text import printable
 
@@ -209,15 +209,6 @@ class Recording:
             self.journal, capacity=capacity, lossless=lossless, before_sync=self._note_losses
         )
 
-    @classmethod
-    def named_by_time(cls, prefix: str, storage: str, *, lossless: bool = False) -> Recording:
-        """Start a recording in the current directory, named `PREFIX_DATE-TIME`, or that and a number."""
-        for name in names_by_time(prefix):
-            # Other processes may take the same name.
-            with suppress(FileExistsError):
-                return cls(Path(name), storage, lossless=lossless)
-        raise AssertionError('there is always another name')
-
     @property
     def error(self) -> OSError | None:
         """Why nothing more can be recorded. None: no error. `finish` raises it."""
@@ -390,3 +381,45 @@ class Recording:
         raise RecordingError(
             f'{what}. The recorded messages are in {found}: recover_run {found} writes the bag from it'
         )
+
+
+def open_recording(
+    prefix: str, output: str | None, storage: str, *, lossless: bool = False, replace: bool = False
+) -> Recording:
+    """Start a recording to a path of the user, or in the current directory as `PREFIX_DATE-TIME`.
+
+    Raises:
+        OSError: The bag exists or cannot be written. The message names it.
+    """
+    try:
+        if output is not None:
+            return Recording(Path(output), storage, lossless=lossless, replace=replace)
+        for name in names_by_time(prefix):
+            # Other processes may take the same name.
+            with suppress(FileExistsError):
+                return Recording(Path(name), storage, lossless=lossless)
+    except OSError as error:
+        where = output or 'this directory'
+        raise OSError(f'cannot record to {where}: {(error.strerror or str(error)).lower()}') from error
+    raise AssertionError('there is always another name')
+
+
+@contextmanager
+def saved_on_error(recording: Recording | None) -> Iterator[None]:
+    """Finish a recording if an exception is raised; discard it if that is a `UserError`.
+
+    Without an exception the recording stays open.
+    """
+    try:
+        yield
+    except UserError:
+        # Nothing ran.
+        if recording is not None:
+            recording.discard()
+        raise
+    except BaseException:
+        # The first error is the one to report.
+        if recording is not None:
+            with suppress(RecordingError):
+                recording.finish()
+        raise

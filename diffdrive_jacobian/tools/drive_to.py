@@ -64,7 +64,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
-        from diffdrive_jacobian.recording.record import saved_on_error
+        from diffdrive_jacobian.recording.recording import saved_on_error
 
     goals: Goals = np.empty((0, 3))
     if path is not None:
@@ -133,7 +133,7 @@ def _drive_with_page(
     """
     # Not above: --help needs no ROS.
     from diffdrive_jacobian.drives import DriveError
-    from diffdrive_jacobian.recording.record import saved_on_error
+    from diffdrive_jacobian.recording.recording import saved_on_error
 
     recording, given = None, bool(options.coordinates or options.path)
     try:
@@ -179,7 +179,7 @@ def _recording(options: argparse.Namespace) -> Recording | None:
     """
     if options.no_record:
         return None
-    from diffdrive_jacobian.recording.record import open_recording
+    from diffdrive_jacobian.recording.recording import open_recording
 
     return open_recording(
         'drive', options.output, 'mcap', lossless=options.lockstep, replace=options.force

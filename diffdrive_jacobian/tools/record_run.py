@@ -18,7 +18,7 @@ from diffdrive_jacobian.tools._messages import Waiting, busy, counted, describe_
 from diffdrive_jacobian.tools._startup import long_lived
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.recording.record import Status
+    from diffdrive_jacobian.recording.recorder import Status
 
 PROGRAM = 'record_run'
 STATUS_PERIOD = {True: 0.5, False: 10.0}
@@ -97,8 +97,8 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             parser.error(f'{option.replace("topics", "TOPIC")} has no effect with --all')
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
-        from diffdrive_jacobian.recording.record import open_recording, record
-        from diffdrive_jacobian.recording.recording import RecordingError
+        from diffdrive_jacobian.recording.recorder import record
+        from diffdrive_jacobian.recording.recording import RecordingError, open_recording
 
     topics = tuple(options.topics)
     selection = Selection(

@@ -26,7 +26,7 @@ from diffdrive_jacobian.nodes.remote_goal import Result, send_path
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.plots.run_figure import figure
 from diffdrive_jacobian.plots.run_table import write_csv
-from diffdrive_jacobian.recording.record import open_recording
+from diffdrive_jacobian.recording.recording import open_recording
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.drive_to import main
 
