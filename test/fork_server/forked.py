@@ -32,6 +32,7 @@ import threading
 import types
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TextIO
@@ -89,7 +90,9 @@ def serve(descriptor: int, listening: int, modules: list[str]) -> None:
             if ready is listener:
                 children[listener.accept()[0]] = set()
                 continue
-            data, received, _, _ = socket.recv_fds(ready, LARGEST, RESERVED)
+            data, received = b'', []
+            with suppress(ConnectionError):
+                data, received, _, _ = socket.recv_fds(ready, LARGEST, RESERVED)
             if not data:
                 ready.close()
                 if ready is starter:
@@ -103,7 +106,7 @@ def serve(descriptor: int, listening: int, modules: list[str]) -> None:
             if isinstance(request, int):
                 code = os.waitstatus_to_exitcode(os.waitpid(request, 0)[1])
                 children[ready].discard(request)
-                ready.send(marshal.dumps(code))
+                _answer(ready, code)
                 continue
             # Signals that come before the child is ready for them wait.
             signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
@@ -127,7 +130,13 @@ def serve(descriptor: int, listening: int, modules: list[str]) -> None:
             for each in received:
                 os.close(each)
             children[ready].add(pid)
-            ready.send(marshal.dumps(pid))
+            _answer(ready, pid)
+
+
+def _answer(connection: socket.socket, number: int) -> None:
+    """Send an answer. Who has closed the connection meanwhile is noticed when it is read next."""
+    with suppress(ConnectionError):
+        connection.send(marshal.dumps(number))
 
 
 class _SharedModules:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import marshal
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -115,6 +117,15 @@ def test_processes_share_a_server():
     one, other = (forked.run(SHARED, arguments, modules=()) for _ in range(2))
     assert one.stdout == other.stdout
     assert int(one.stdout) != os.getpid()
+
+
+def test_a_server_goes_on_after_a_command_that_was_killed_before_the_answer():
+    program = ('', 'import time; time.sleep(60)', ['-c'], os.getcwd(), dict(os.environ))
+    for _ in range(5):
+        command = forked._Connection(forked._server(forked.EVERYTHING, os.getpid()).path)
+        socket.send_fds(command._socket, [marshal.dumps(((), *program))], ())
+        command._socket.close()
+    assert forked.run('raise SystemExit(3)').returncode == 3
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL, signal.SIGHUP, signal.SIGINT])
