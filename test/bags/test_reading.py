@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import struct
 
@@ -27,7 +26,6 @@ from support.ros_messages import (
 from support.runs import built_run, sample, series
 
 from diffdrive_jacobian.bags import BagError, read_run
-from diffdrive_jacobian.bags import run as run_module
 from diffdrive_jacobian.bags import timeline as timeline_module
 from diffdrive_jacobian.bags.bag_reader import ReadingInterruptedError
 from diffdrive_jacobian.bags.bag_writer import build_bag
@@ -163,11 +161,6 @@ def test_a_run_and_a_series_are_printed_in_short(tmp_path):
             ')',
         ]
     )
-
-
-def test_the_columns_of_every_series_are_named():
-    for name in FIELDS:
-        assert f'`[{", ".join(run_module.COLUMNS[name])}]`' in inspect.getsource(run_module)
 
 
 # --- Names
