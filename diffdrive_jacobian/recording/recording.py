@@ -58,7 +58,6 @@ class JournalThread:
         self,
         journal: JournalWriter,
         *,
-        capacity: int = CAPACITY,
         lossless: bool = False,
         before_sync: Callable[[], None] = lambda: None,
     ) -> None:
@@ -66,12 +65,10 @@ class JournalThread:
 
         Args:
             journal: Where the records are written.
-            capacity: Memory for records that wait to be written (bytes).
-            lossless: Whether `add` waits when that is used up. Otherwise it drops messages.
+            lossless: Whether `add` waits when `CAPACITY` is used up. Otherwise it drops messages.
             before_sync: Called in the thread before each sync.
         """
         self._journal = journal
-        self._capacity = capacity
         self._lossless = lossless
         self._before_sync = before_sync
         self._changed = threading.Condition()
@@ -111,7 +108,7 @@ class JournalThread:
         def room() -> bool:
             waiting = self._journal.waiting
             # A message larger than the capacity is accepted when nothing else waits.
-            return waiting == 0 or waiting + size <= self._capacity or self.error is not None
+            return waiting == 0 or waiting + size <= CAPACITY or self.error is not None
 
         if self._lossless and not room():
             with self._changed:
@@ -162,7 +159,6 @@ class Recording:
         *,
         lossless: bool = False,
         replace: bool = False,
-        capacity: int = CAPACITY,
     ) -> None:
         """Start to record. The directory of the bag is created at the end.
 
@@ -171,7 +167,6 @@ class Recording:
             storage: `mcap` or `sqlite3`.
             lossless: Whether `add` waits for a disk that is too slow. Otherwise messages are dropped.
             replace: Whether the bag may replace another one, which stays until then.
-            capacity: Memory for messages that wait to be written (bytes).
 
         Raises:
             FileExistsError: The journal exists, or the bag, and it is not to be replaced or is no bag.
@@ -205,9 +200,7 @@ class Recording:
             self.journal.close()
             journal.unlink()
             raise
-        self._thread = JournalThread(
-            self.journal, capacity=capacity, lossless=lossless, before_sync=self._note_losses
-        )
+        self._thread = JournalThread(self.journal, lossless=lossless, before_sync=self._note_losses)
 
     @property
     def error(self) -> OSError | None:

@@ -206,9 +206,9 @@ def test_a_folder_of_the_user_stays(tmp_path):
 # --- A slow disk
 
 
-def busy(path, disk, **options):
+def busy(path, disk):
     """Return a recording whose thread waits for the disk, with one message."""
-    recording = Recording(path, 'mcap', **options)
+    recording = Recording(path, 'mcap')
     disk.ready.clear()
     add_all(recording, CHANNEL, *messages(1))
     until(lambda: disk.writes, 'the thread writes')
@@ -228,9 +228,10 @@ def test_a_slow_disk_loses_no_message_delays_no_caller_and_gets_few_writes(tmp_p
 
 
 @pytest.mark.parametrize('size', [2, 1_000_000])
-def test_memory_is_bounded_and_what_is_dropped_is_counted(tmp_path, disk, size):
+def test_memory_is_bounded_and_what_is_dropped_is_counted(tmp_path, disk, monkeypatch, size):
     capacity = max(100_000, 10 * size)
-    recording = busy(tmp_path / 'run', disk, capacity=capacity)
+    monkeypatch.setattr(recordings, 'CAPACITY', capacity)
+    recording = busy(tmp_path / 'run', disk)
     count = 3 * capacity // (size + 300)
     for record in messages(count, size=size):
         recording.add(record)
@@ -247,16 +248,18 @@ def test_memory_is_bounded_and_what_is_dropped_is_counted(tmp_path, disk, size):
     assert os.listdir(tmp_path) == ['run']
 
 
-def test_a_message_larger_than_the_memory_is_taken_alone(tmp_path):
-    recording = Recording(tmp_path / 'run', 'mcap', capacity=1_000)
+def test_a_message_larger_than_the_memory_is_taken_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(recordings, 'CAPACITY', 1_000)
+    recording = Recording(tmp_path / 'run', 'mcap')
     add_all(recording, CHANNEL)
     until(lambda: recording.journal.waiting == 0, 'all is written')
     add_all(recording, *messages(1, size=100_000))
     assert recording.finish().messages == 1
 
 
-def test_a_lossless_recording_waits_for_the_disk(tmp_path, disk):
-    recording = Recording(tmp_path / 'run', 'mcap', lossless=True, capacity=2_000)
+def test_a_lossless_recording_waits_for_the_disk(tmp_path, disk, monkeypatch):
+    monkeypatch.setattr(recordings, 'CAPACITY', 2_000)
+    recording = Recording(tmp_path / 'run', 'mcap', lossless=True)
     add_all(recording, CHANNEL)
     disk.ready.clear()
     release = threading.Timer(0.2, disk.ready.set)
