@@ -14,6 +14,9 @@ from rclpy.timer import Timer
 
 from diffdrive_jacobian.lockstep._clock import Agenda
 
+FREE = object()
+"""Result of a callback that has done nothing, and therefore takes no time."""
+
 
 class Waiting(NamedTuple):
     """A callback that waits at a gate."""
@@ -133,13 +136,16 @@ class Gate:
         if not duration:
             return work()
         self._gates.running = self
+        result = None
         try:
-            return work()
+            result = work()
+            return result
         finally:
             self._gates.running = None
-            self._busy = True
-            self._agenda.at(self._agenda.now + duration, partial(self._finish, self._life))
-            self._change()
+            if result is not FREE:
+                self._busy = True
+                self._agenda.at(self._agenda.now + duration, partial(self._finish, self._life))
+                self._change()
 
     def serve_next(self) -> None:
         """Execute the oldest callback that waits."""

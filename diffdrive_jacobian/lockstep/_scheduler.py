@@ -19,7 +19,6 @@ from rclpy.duration import Duration
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from diffdrive_jacobian.lockstep._clock import Agenda, Clocks, Timers, is_due
@@ -65,10 +64,6 @@ class Scheduler:
         self._changed = False
         self._has_actions = False
         self._has_events = False
-        self.isolated = True
-        """Whether there are no messages from other processes."""
-        self.unserved: set[Subscription] = set()
-        """Subscriptions whose messages are not taken."""
         self.killed: set[Node] = set()
         """The nodes that were removed without being stopped."""
         self.agenda = Agenda()
@@ -222,9 +217,7 @@ class Scheduler:
 
     def _has_work(self) -> bool:
         """Return whether anything waits to be executed, or may wait without having been noticed."""
-        return bool(
-            self.links.pending or self._changed or self.tasks or self._has_actions or not self.isolated
-        )
+        return bool(self.links.pending or self._changed or self.tasks or self._has_actions)
 
     def _sooner(self, until_next: int | None) -> int | None:
         """Return the time until the next timer or action (ns); None: there is none."""
@@ -263,7 +256,7 @@ class Scheduler:
             after_callback: Whether nothing but a callback was executed since the last call. What it has
                 sent is known.
         """
-        events = not after_callback or self._has_events or not self.isolated
+        events = not after_callback or self._has_events
         while True:
             self._drain(events)
             if self._register_changed():
@@ -271,11 +264,6 @@ class Scheduler:
                 events = True
             elif not (self.tasks and self.tasks.run()):
                 return
-
-    def serve(self) -> None:
-        """Process requests and responses. Messages wait."""
-        self._handle_events()
-        self._register_changed()
 
     def _drain(self, events: bool = True) -> None:
         """Process messages and events until none is left.
@@ -405,8 +393,7 @@ class Scheduler:
         self._events.wake()
         # The registration itself does not count as an event.
         self._handle_events()
-        without = self.clocks.find(self._members) | self.unserved
-        new = self.links.update(self._members.values(), without)
+        new = self.links.update(self._members.values(), self.clocks.find(self._members))
         # Messages that a subscription has received before.
         for link in sorted(new, key=lambda link: link.latched):
             self.links.admit(link)

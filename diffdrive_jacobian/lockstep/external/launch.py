@@ -1,0 +1,78 @@
+"""Run a command, and end all that it has started when it ends, or when nobody waits for it any more.
+
+    python -IS launch.py PROGRAM ARGUMENT ...
+
+Standard input is a pipe from the world that has started this. When anything arrives there, or the world
+is gone, everything is killed. Descendants whose parents have ended become children of this process, so
+none is missed. It ends as the command does.
+"""
+
+import ctypes
+import os
+import resource
+import select
+import signal
+import sys
+
+PR_SET_CHILD_SUBREAPER = 36
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+"""Signals to the group, which are for the command."""
+
+
+def main() -> None:
+    """Run the command that the arguments give."""
+    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    try:
+        pid = os.posix_spawnp(
+            sys.argv[1],
+            sys.argv[1:],
+            os.environ,
+            file_actions=[(os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0)],
+            # Python ignores the last two.
+            setsigdef=(*SIGNALS, signal.SIGPIPE, signal.SIGXFSZ),
+        )
+    except OSError as error:
+        sys.exit(f'{sys.argv[1]} cannot be started: {error}')
+    status = None
+    while status is None and 0 not in select.select([0, reader], [], [])[0]:
+        os.read(reader, 100)
+        status = ended_children(os.WNOHANG).get(pid)
+    while children := own_children():
+        for child in children:
+            os.kill(child, signal.SIGKILL)
+        status = ended_children(0).get(pid, status)
+    code = os.waitstatus_to_exitcode(status or 0)
+    if code >= 0:
+        os._exit(code)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if -code not in (signal.SIGKILL, signal.SIGSTOP):
+        signal.signal(-code, signal.SIG_DFL)
+    os.kill(os.getpid(), -code)
+
+
+def own_children() -> list[int]:
+    """Return the ids of the children, also of those that have ended and were not waited for."""
+    with open(f'/proc/self/task/{os.getpid()}/children', encoding='ascii') as file:
+        return [int(child) for child in file.read().split()]
+
+
+def ended_children(options: int) -> dict[int, int]:
+    """Wait for children that have ended. Return the status of each. 0: wait for one, at least."""
+    found = {}
+    try:
+        while (ended := os.waitpid(-1, options))[0]:
+            found[ended[0]] = ended[1]
+            options = os.WNOHANG
+    except ChildProcessError:
+        pass
+    return found
+
+
+if __name__ == '__main__':
+    main()

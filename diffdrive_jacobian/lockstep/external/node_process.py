@@ -1,0 +1,766 @@
+"""A process whose nodes take part in a lockstep world, unchanged, each with a node that stands for it.
+
+Each process has a ROS domain of its own, in which the world has an endpoint for each of its topics and
+services. So its nodes keep all their names, and no process receives what another one sends directly. In
+the world stands a `StandIn` for each of its nodes, with the same name, topics and services. What that
+receives is sent to the process, one message at a time, and the world waits until the process is quiet.
+What it has sent meanwhile is published by the stand-in. So faults, properties and recordings treat it as
+any other node.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rcl_interfaces.srv import GetParameters
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
+
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._gate import FREE
+from diffdrive_jacobian.lockstep._link import Link, Source, Stage
+from diffdrive_jacobian.lockstep._nodes import Nodes
+from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
+from diffdrive_jacobian.lockstep.external import graph as graphs
+from diffdrive_jacobian.lockstep.external import relays
+from diffdrive_jacobian.lockstep.external.datagrams import LIMIT, QUEUE, Datagrams, sockets_of
+from diffdrive_jacobian.lockstep.external.process import CLOSING, ExternalProcess, free_domain
+from diffdrive_jacobian.lockstep.external.quiet import (
+    Allowance,
+    Quiet,
+    own_run_times,
+    threads_of_this_process,
+)
+from diffdrive_jacobian.lockstep.external.relays import CALL, INPUT, SERVICE, TOPIC, Arrived, Relay
+from diffdrive_jacobian.messages.conversion import set_time
+from diffdrive_jacobian.messages.names import node_of
+from diffdrive_jacobian.ros.fastdds_profiles import for_other_process
+from diffdrive_jacobian.ros.rclpy_internals import (
+    graph_changed,
+    raw_sender,
+    send_request,
+    take_response,
+)
+from diffdrive_jacobian.ros.runner import DISCOVERY, environment, ros_context
+from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+PERIOD = 0.01
+"""Period at which the graph is looked at while a process starts (s)."""
+REPETITION = 1.0
+"""Period at which a request is repeated while a process starts (s): a response may be lost then."""
+SILENCE = 0.2
+"""Time for which a process that has started must not send anything by itself (s)."""
+SUBSCRIBING = 3.0
+"""Least time until a node must be subscribed to /clock (s): its name may be discovered before."""
+UNCONFIRMED = 0.5
+"""Time for nodes without parameter services to discover the endpoints of the world (s)."""
+UNASKED = 100
+"""Largest number of deliveries after which the graph is looked at, although nothing new was told."""
+END = 2.0
+"""Time in which a process ends after a process of its nodes has (s)."""
+ATTEMPTS = 2
+"""Number of domains that are tried, if a program that the world has not started comes into one."""
+
+
+class ForeignNodeError(LockstepError):
+    """There is a node in the domain that is in no process of the world."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """How a process is started: the arguments of `Lockstep.start`."""
+
+    command: Sequence[str | os.PathLike[str]]
+    use_sim_time: bool
+    cwd: str | os.PathLike[str] | None
+    env: Mapping[str, str]
+    clock_period: float
+    queue_depth: int
+    timeout: float
+    patience: float
+
+    def __post_init__(self) -> None:
+        """Check the command."""
+        command = [] if isinstance(self.command, (str, bytes, os.PathLike)) else self.command
+        if not (isinstance(command, Sequence) and command and all(map(_is_text, command))):
+            raise _error(
+                "start takes a program and its arguments, ['ros2', 'run', 'my_package', 'my_node']",
+                self.command,
+            )
+        if not (self.cwd is None or _is_text(self.cwd)):
+            raise _error('cwd must be a path', self.cwd)
+        if not isinstance(self.env, Mapping) or not all(map(_is_variable, self.env.items())):
+            raise _error("env must be names with texts, {'NAME': 'value'}", self.env)
+        depth = self.queue_depth
+        if isinstance(depth, bool) or not isinstance(depth, int) or not 0 < depth < relays.DEPTH:
+            raise _error(f'queue_depth must be an integer from 1 to {relays.DEPTH - 1}', depth)
+        for name in ('clock_period', 'timeout', 'patience'):
+            checked_nanoseconds(name, getattr(self, name))
+
+    def start(self, domain: Mapping[str, str]) -> ExternalProcess:
+        """Start the process, with environment variables for its ROS domain."""
+        timed = ('--ros-args', '-p', 'use_sim_time:=true') if self.use_sim_time else ()
+        hash_seed = {} if 'PYTHONHASHSEED' in os.environ else {'PYTHONHASHSEED': '0'}
+        return ExternalProcess(
+            [*(os.fspath(part) for part in self.command), *timed],
+            {**domain, **for_other_process(), **hash_seed, **self.env},
+            None if self.cwd is None else os.fspath(self.cwd),
+        )
+
+
+def _error(allowed: str, got: object) -> LockstepError:
+    return LockstepError(f'{allowed}, got {printable(repr(got), 200)}')
+
+
+def _is_text(value: Any) -> bool:
+    """Return whether a value is a text, or a path, that can be passed to a process."""
+    return isinstance(value, (str, os.PathLike)) and '\0' not in str(os.fspath(value))
+
+
+def _is_variable(item: tuple[Any, Any]) -> bool:
+    """Return whether a name and a value are those of an environment variable."""
+    name, value = item
+    if not (isinstance(name, str) and isinstance(value, str)):
+        return False
+    return bool(name) and '=' not in name and '\0' not in name + value
+
+
+class StandIn(Node):  # type: ignore[misc]
+    """A node of the world for a node of a process. If it is destroyed, the process is ended."""
+
+    def __init__(self, graph: graphs.NodeGraph, end: Callable[[StandIn], None]) -> None:
+        """Create it with the name of the node, without topics."""
+        super().__init__(
+            graph.name,
+            namespace=graph.namespace,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+            parameter_overrides=[
+                Parameter('use_sim_time', value=True),
+                Parameter('start_type_description_service', value=False),
+            ],
+        )
+        self._end = end
+
+    def destroy_node(self) -> None:
+        """Destroy the node, and end the process."""
+        self._end(self)
+        super().destroy_node()
+
+
+class NodeProcess:
+    """A process with nodes in the world, as of `Lockstep.start`. It is ended with the world."""
+
+    def __init__(
+        self,
+        command: Command,
+        nodes: Nodes,
+        scheduler: Scheduler,
+        extend: Callable[[float], None],
+        is_open: Callable[[], bool],
+    ) -> None:
+        """Start nothing yet.
+
+        Args:
+            command: How to start it.
+            nodes: The nodes of the world.
+            scheduler: Executes the nodes.
+            extend: Receives the wall time (s) that was spent waiting for the process.
+            is_open: Returns whether the world was not closed.
+        """
+        self._command, self._nodes, self._scheduler = command, nodes, scheduler
+        self._extend, self._is_open = extend, is_open
+        self._clocks = scheduler.clocks
+        self._ended: list[ExternalProcess] = []
+        self._names: set[str] = set()
+        """Of all nodes that it has had."""
+        self._closing = ExitStack()
+        self._reset()
+        self._scheduler.links.filter(self._drop_echoes, first=True)
+        self._nodes.on_change.append(self._on_change)
+        self.child: ExternalProcess
+
+    def _reset(self) -> None:
+        self._connected = False
+        self._stand_ins: dict[str, StandIn] = {}
+        self._relays: dict[tuple[int, str], Relay] = {}
+        self._latched: list[Arrived] = []
+        self._qualities: dict[tuple[int, str], set[graphs.Quality]] = {}
+        self._sent: dict[str, list[bytes]] = {}
+        self._clock_publishers: dict[str, Publisher] = {}
+        self._participants: set[int] = set()
+        self._called: dict[str, tuple[str, StandIn]] = {}
+        self._services_changed = True
+        self._given = -1
+        self._exchanges = 0
+        self._listeners: list[int] = []
+        self._listened: list[int] = []
+
+    # --- What the test sees
+
+    @property
+    def nodes(self) -> list[Node]:
+        """The nodes of the world that stand for those of the process."""
+        return list(self._stand_ins.values())
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self.child.pid
+
+    @property
+    def returncode(self) -> int | None:
+        """Exit code, negative if a signal ended it. None: it runs. Its children end with it."""
+        return self.child.returncode
+
+    @property
+    def stdout(self) -> str:
+        """What it has printed on the standard output, also before a fault has started it again."""
+        return ''.join(one.printed(0) for one in (*self._ended, self.child))
+
+    @property
+    def stderr(self) -> str:
+        """What it has printed on the standard error stream, as `stdout`."""
+        return ''.join(one.printed(1) for one in (*self._ended, self.child))
+
+    @property
+    def command(self) -> str:
+        """The command line."""
+        return self.child.command
+
+    def signal(self, number: int) -> None:
+        """Send a signal to it and its children. Nothing happens if it has ended."""
+        self.child.signal(number)
+
+    def stop(self, timeout: float = CLOSING) -> int:
+        """End it by SIGINT, and kill it if it does not end. Return the exit code.
+
+        What it publishes at its end is received by the others. A fault does not start it again.
+
+        Args:
+            timeout: Longest time for its end (s).
+        """
+        checked_nanoseconds('timeout', timeout)
+        self._forget()
+        return self._stop(timeout)
+
+    def _stop(self, timeout: float = CLOSING) -> int:
+        code = self.child.stop(timeout)
+        if self._connected:
+            self._wait()
+            self._forward(self._take())
+            self.check_lost(now=True)
+        self._leave()
+        return code
+
+    def kill(self) -> None:
+        """Kill it. Nothing that was sent to it is processed, and a fault does not start it again."""
+        self._forget()
+        self._kill()
+
+    def _kill(self) -> None:
+        self._scheduler.killed.update(self._stand_ins.values())
+        self.child.kill()
+        self._leave()
+
+    def _forget(self) -> None:
+        """Do not let a fault start it again."""
+        for name in self._names:
+            self._nodes.forget(name)
+
+    def describe(self) -> str:
+        """Return its state, and the end of what it printed."""
+        return self.child.describe()
+
+    # --- Start and end
+
+    def start(self) -> list[StandIn]:
+        """Start the process, wait until its nodes are discovered, and return their stand-ins.
+
+        Raises:
+            LockstepError: They are not within the timeout, or cannot take part.
+        """
+        begin = time.monotonic()
+        if hasattr(self, 'child'):
+            self.child.close()
+            self._ended.append(self.child)
+        for attempt in range(ATTEMPTS):
+            try:
+                self._launch()
+                self._connect()
+                break
+            except BaseException as error:
+                self.close()
+                if not isinstance(error, ForeignNodeError) or attempt == ATTEMPTS - 1:
+                    raise
+        self._extend(time.monotonic() - begin)
+        return list(self._stand_ins.values())
+
+    def _launch(self) -> None:
+        """Start the process, and create what is needed to receive from it."""
+        self._domain = free_domain()
+        domain = {DISCOVERY[0]: 'LOCALHOST', 'ROS_DOMAIN_ID': str(self._domain)}
+        before, others = threads_of_this_process(), sockets_of(os.getpid())
+        with environment({**dict.fromkeys(DISCOVERY), **domain}):
+            context = self._closing.enter_context(ros_context(['lockstep']))
+        self._outside = Node(
+            'lockstep_of_world',
+            context=context,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+            parameter_overrides=[Parameter('start_type_description_service', value=False)],
+        )
+        self._closing.callback(self._outside.destroy_node)
+        receiving = threads_of_this_process() - before
+        self.child = self._command.start(domain)
+        self._quiet = Quiet(self.child.root, receiving)
+        self._closing.callback(self._quiet.close)
+        self._listeners = self._quiet.listeners()
+        self._datagrams = Datagrams()
+        self._datagrams.watch(os.getpid(), but=others)
+
+    def join(self) -> None:
+        """Add the nodes to the world. They receive the time."""
+        for name, node in self._stand_ins.items():
+            self._nodes.created(node, partial(self._restart, name))
+            self._names.add(name)
+            if node not in self._scheduler.nodes:
+                self._nodes.check_new(node)
+                self._nodes.add(node, observer=False)
+        self._connected = True
+        (first, *_) = self._stand_ins.values()
+        first.create_timer(self._command.clock_period, self._give_time)
+        first.executor.create_task(self._begin)
+
+    def _begin(self) -> None:
+        """Forward what the process has latched before it took part, and give it the time."""
+        latched, self._latched = self._latched, []
+        self._forward(latched)
+        self._give_time()
+
+    def _restart(self, name: str) -> Node:
+        """Start the process again, after a fault has killed it. Return the node of a name."""
+        stand_ins = self.start()
+        found = next((one for one in stand_ins if one.get_fully_qualified_name() == name), None)
+        if found is None:
+            raise LockstepError(f'{self.child.title} was started again, and has no node {name} now')
+        self.join()
+        return found
+
+    def _on_destroyed(self, stand_in: StandIn) -> None:
+        """End the process: a test or a fault has destroyed one of its nodes."""
+        if not self._is_open() or stand_in not in self._stand_ins.values():
+            return
+        if stand_in in self._scheduler.killed:
+            self._kill()
+        else:
+            self._stop()
+
+    def _leave(self) -> None:
+        """Remove the nodes from the world."""
+        nodes, ended = self.nodes, self._relays
+        self._reset()
+        for node in nodes:
+            node.destroy_node()
+        for relay in ended.values():
+            relay.close()
+        self._closing.close()
+
+    def close(self) -> None:
+        """Kill the process if it has not ended, and forget its nodes."""
+        if hasattr(self, 'child'):
+            self.child.kill()
+            self.child.close()
+        self._leave()
+
+    # --- Discovery
+
+    def _connect(self) -> None:
+        """Wait until the nodes of the process and the world have discovered each other."""
+        allowance = Allowance(self._quiet, self._command.timeout)
+        subscribing: Allowance | None = None
+        while True:
+            while not (self._learn() and self._is_matched()):
+                self.child.check_running()
+                if allowance.is_used_up():
+                    raise LockstepError(self._not_discovered())
+                time.sleep(PERIOD)
+            known = len(self._relays)
+            self._confirm(allowance)
+            graph_changed(self._outside)
+            if self._learn() and len(self._relays) == known:
+                if not (untimed := self._untimed()):
+                    break
+                subscribing = subscribing or Allowance(self._quiet, SUBSCRIBING)
+                if subscribing.is_used_up():
+                    raise LockstepError(
+                        f'{", ".join(untimed)} of {self.child.title} is not subscribed to /clock: its '
+                        'parameter use_sim_time must be true; if it needs no time: '
+                        'start(..., use_sim_time=False)'
+                    )
+                time.sleep(SILENCE)
+        self._wait()
+        # Others than latched ones came before anybody could be subscribed.
+        self._latched = [arrived for arrived in self._take() if arrived.latched]
+        time.sleep(SILENCE)
+        self._wait()
+        late = self._take()
+        self._latched += [arrived for arrived in late if arrived.latched]
+        self._refuse([arrived for arrived in late if not arrived.latched])
+        self._quiet.learn()
+        for pid in self._participants:
+            self._datagrams.watch(pid)
+
+    def _is_matched(self) -> bool:
+        """Return whether the world has discovered all endpoints of the process."""
+        return all(relay.is_matched() for relay in self._relays.values()) and all(
+            publisher.get_subscription_count() for publisher in self._clock_publishers.values()
+        )
+
+    def _learn(self) -> bool:
+        """Create what the topics and services of the process need. Return whether it has nodes."""
+        found = graphs.nodes_beside(self._outside)
+        offered = {name for graph in found for name in graph.services}
+        for graph in found:
+            self._check_started_by_world(graph)
+            name = graph.full_name
+            if name not in self._stand_ins:
+                self._stand_ins[name] = StandIn(graph, self._on_destroyed)
+            node = self._stand_ins[name]
+            self._learn_topics(graph, node)
+            for service, kind in graph.services.items():
+                self._relay(SERVICE, service, kind, node, relays.offered_service, self._deliver)
+            for service, kind in graph.clients.items():
+                if service not in offered:
+                    self._called.setdefault(service, (kind, node))
+        self._offer_called()
+        return bool(found)
+
+    def _learn_topics(self, graph: graphs.NodeGraph, node: StandIn) -> None:
+        outside, name = self._outside, graph.full_name
+        for topic, kind in graph.publishers.items():
+            infos = outside.get_publishers_info_by_topic(topic)
+            profile = self._profile(TOPIC, topic, graphs.qualities_of(infos, name), relays.DEPTH)
+            sent = self._sent.setdefault(topic, [])
+            self._relay(TOPIC, topic, kind, node, relays.from_topic, profile, sent)
+        for topic, kind in graph.subscriptions.items():
+            if kind == graphs.CLOCK_TYPE and topic.rpartition('/')[2] == 'clock':
+                if topic not in self._clock_publishers:
+                    self._clock_publishers[topic] = outside.create_publisher(Clock, topic, 1)
+                continue
+            depth = self._command.queue_depth
+            infos = outside.get_subscriptions_info_by_topic(topic)
+            profile = self._profile(INPUT, topic, graphs.qualities_of(infos, name), depth)
+            sent = self._sent.setdefault(topic, [])
+            self._relay(
+                *(INPUT, topic, kind, node, relays.to_topic),
+                *(profile, self._deliver, sent, self._command.patience),
+            )
+
+    def _profile(
+        self, role: int, topic: str, qualities: Iterable[graphs.Quality], depth: int
+    ) -> QoSProfile:
+        """Return the profile of a topic, whose depth the graph does not show.
+
+        Raises:
+            LockstepError: There are several.
+        """
+        known = self._qualities.setdefault((role, topic), set())
+        known |= set(qualities)
+        ((reliability, durability), *others) = known
+        if others:
+            found = sorted(f'{one.name} and {other.name}' for one, other in known)
+            raise LockstepError(
+                f'{self.child.title} uses {topic} with several qualities of service, at once or one '
+                f'after the other: {", ".join(found)}; a process may use one for each topic'
+            )
+        return QoSProfile(depth=depth, reliability=reliability, durability=durability)
+
+    def _relay(
+        self, role: int, name: str, kind: str, node: StandIn, create: Callable[..., Relay], *args: Any
+    ) -> None:
+        """Create a relay unless it is there. DDS does not promise an order between topics: by name."""
+        if (role, name) not in self._relays:
+            imported = graphs.import_type(kind, f'{name} of {node.get_fully_qualified_name()}')
+            self._relays[role, name] = create(self._outside, node, name, imported, *args)
+            self._relays = dict(sorted(self._relays.items()))
+
+    def _on_change(self) -> None:
+        self._services_changed = True
+
+    def _offer_called(self) -> None:
+        """Offer the process the services that it calls and that other nodes of the world have."""
+        self._services_changed = False
+        there = {
+            service.service_name
+            for node in self._scheduler.nodes
+            if node not in self._stand_ins.values()
+            for service in node.services
+        }
+        for name, (kind, node) in self._called.items():
+            if name in there:
+                self._relay(CALL, name, kind, node, relays.called_service, self._deliver)
+
+    def _check_started_by_world(self, graph: graphs.NodeGraph) -> None:
+        """Check that a node is in the process or one that it has started."""
+        infos = [
+            info
+            for topic in graph.publishers.keys() | graph.subscriptions.keys()
+            for info in (
+                *self._outside.get_publishers_info_by_topic(topic),
+                *self._outside.get_subscriptions_info_by_topic(topic),
+            )
+            if node_of(info) == graph.full_name
+        ]
+        numbers = {int.from_bytes(bytes(info.endpoint_gid)[graphs.PID], 'little') for info in infos}
+        pids = {pid for pid in self._quiet.processes() if pid & 0xFFFF in numbers}
+        if numbers and not pids:
+            raise ForeignNodeError(
+                f'node {graph.full_name} is in domain {self._domain}, but in no process that '
+                f'{self.child.title} has started and that runs on: a container or another machine '
+                'cannot take part in lockstep'
+            )
+        self._participants |= pids
+        if len(self._participants) > 1:
+            raise LockstepError(
+                f'{self.child.title} has started several processes with nodes: '
+                f'{", ".join(map(str, sorted(self._participants)))}; start each of them by itself, '
+                'because messages between them would not be received one at a time'
+            )
+
+    def _confirm(self, allowance: Allowance) -> None:
+        """Wait until the nodes respond, which shows that they have discovered what the world has.
+
+        They discover endpoints in the order of their creation, so those of new clients come last.
+        """
+        names = [
+            relay.client.service_name
+            for relay in self._relays.values()
+            if relay.client is not None and relay.client.srv_type is GetParameters
+        ]
+        for name in names:
+            self._await_response(name, allowance)
+        if len(names) < len(self._stand_ins):
+            time.sleep(UNCONFIRMED)
+            self._wait()
+
+    def _await_response(self, name: str, allowance: Allowance) -> None:
+        """Ask a node for a parameter until it has responded to the last request, so to all of them."""
+        client = self._outside.create_client(GetParameters, name)
+        begin, number, response = time.monotonic(), 0, None
+        while not number or response is None or response[0] != number:
+            self.child.check_running()
+            if allowance.is_used_up():
+                raise LockstepError(
+                    f'{name} does not respond: the executor of the node does not spin, or waits for '
+                    'what comes later, as a service in its constructor; '
+                    f'{self._quiet.describe()}\n{self.describe()}'
+                )
+            overdue = response is None and time.monotonic() > begin + number * REPETITION
+            if overdue and client.service_is_ready():
+                number = send_request(client, GetParameters.Request(names=['use_sim_time']))
+            time.sleep(PERIOD / 10)
+            response = take_response(client) or response
+        self._outside.destroy_client(client)
+
+    def _untimed(self) -> list[str]:
+        """Return the nodes that should receive the time and do not, as far as is discovered."""
+        timed = {
+            node_of(info)
+            for topic in self._clock_publishers
+            for info in self._outside.get_subscriptions_info_by_topic(topic)
+        }
+        return sorted(self._stand_ins.keys() - timed) if self._command.use_sim_time else []
+
+    def _not_discovered(self) -> str:
+        waited = f'within {self._command.timeout:g} s (timeout=)'
+        missing = [name for (_, name), relay in self._relays.items() if not relay.is_matched()]
+        if missing:
+            return (
+                f'{self.child.title}: not discovered {waited}: {", ".join(missing)}\n{self.describe()}'
+            )
+        hint = 'it has created none, or not yet'
+        if others := _domains(self._quiet.processes()) - {self._domain}:
+            hint = (
+                f'it is in ROS domain {", ".join(map(str, sorted(others)))} instead of {self._domain}: '
+                'it must not set ROS_DOMAIN_ID, which start() sets for it'
+            )
+        return f'no node of {self.child.title} was discovered {waited}: {hint}\n{self.describe()}'
+
+    # --- Exchange
+
+    def _deliver(self, send: Callable[[], object]) -> None:
+        """Give the process the time, send something to it, and forward what it sends meanwhile."""
+        self._give_time()
+        self._exchange(send)
+
+    def _give_time(self) -> object:
+        """Give the process the time, unless it has it. Return FREE if it has sent nothing."""
+        now = self._clocks.now
+        if now == self._given:
+            return FREE
+        self._given = now
+        message = Clock()
+        set_time(message.clock, now)
+        data = serialize_message(message)
+
+        def send() -> None:
+            for publisher in self._clock_publishers.values():
+                raw_sender(publisher)(data)
+
+        return None if self._exchange(send) else FREE
+
+    def _exchange(self, send: Callable[[], object]) -> int:
+        """Send something to the process, wait until it is quiet, and forward what it has sent.
+
+        Returns:
+            How many messages it has sent.
+        """
+        if not self._connected:
+            return 0
+        begin = time.monotonic()
+        if self._services_changed:
+            known = len(self._relays)
+            self._offer_called()
+            if len(self._relays) > known:
+                # The process may call them at once.
+                self._confirm(Allowance(self._quiet, self._command.timeout))
+                self._wait()
+        self._refuse(self._take())
+        send()
+        self._wait()
+        arrived = self._take()
+        self.check_lost()
+        for sent in self._sent.values():
+            sent.clear()
+        self._extend(time.monotonic() - begin)
+        self._forward(arrived)
+        if any(map(self._quiet.has_ended, (self.child.root, *self._participants))):
+            self._on_end()
+        elif self._may_have_changed() and graph_changed(self._outside):
+            self._learn_more()
+        return len(arrived)
+
+    def _may_have_changed(self) -> bool:
+        """Return whether the process may have told something new of its nodes: to ask takes time."""
+        self._exchanges += 1
+        before, self._listened = self._listened, own_run_times(self._listeners)
+        return before != self._listened or not self._listeners or self._exchanges % UNASKED == 0
+
+    def _learn_more(self) -> None:
+        """Create what is needed for topics and services that the process has created meanwhile."""
+        known = len(self._relays)
+        self._learn()
+        if len(self._relays) > known:
+            self._connect()
+            latched, self._latched = self._latched, []
+            self._forward(latched)
+
+    def _wait(self) -> None:
+        """Wait until the process and the threads that receive from it are quiet."""
+        try:
+            self._quiet.wait(self._command.patience)
+        except LockstepError as error:
+            names = ', '.join(self._stand_ins) or self.child.title
+            raise LockstepError(
+                f'{names} {error}\n  a loop that polls or sleeps on wall time cannot run in lockstep, '
+                'also in a program that it has started; for a callback that takes longer: '
+                'start(..., patience=)\n' + self.describe()
+            ) from None
+
+    def _take(self) -> list[Arrived]:
+        """Return what has arrived: messages by the names of their topics, responses, requests."""
+        return [arrived for relay in self._relays.values() for arrived in relay.take()]
+
+    @staticmethod
+    def _forward(arrived: Sequence[Arrived]) -> None:
+        for one in arrived:
+            one.forward()
+
+    def check(self) -> None:
+        """Check that it runs, lost nothing, and has sent nothing while nothing was delivered to it."""
+        if self._connected:
+            self.child.check_running(', '.join(self._stand_ins))
+            self._refuse(self._take())
+            self.check_lost()
+
+    def check_lost(self, *, now: bool = False) -> None:
+        """Raise LockstepError if messages between the world and the process are known to be lost.
+
+        Args:
+            now: Whether to look, even if that was done just before.
+        """
+        if self._connected and self._datagrams.lost(now=now):
+            raise LockstepError(
+                f'messages to or from {", ".join(self._stand_ins)} were lost at '
+                f'{self._clocks.now / NANOSECONDS:g} s or before: more was sent at once than a socket '
+                f'can hold; {LIMIT} allows {Path(LIMIT).read_text().strip()} bytes, and may need '
+                f'{QUEUE}: sysctl -w net.core.rmem_max={QUEUE}'
+            )
+
+    def _refuse(self, arrived: Sequence[Arrived]) -> None:
+        """Raise LockstepError if something has arrived."""
+        if arrived:
+            names = ', '.join(self._stand_ins)
+            what = ', '.join(dict.fromkeys(one.what for one in arrived))
+            raise LockstepError(
+                f'{names} {what} at {self._clocks.now / NANOSECONDS:g} s, while nothing was delivered '
+                'to it: what it sends then differs from run to run. Likely a timer on wall time '
+                '(create_wall_timer), a thread of its own, or a callback that had not ended, because it '
+                'waited for something else than a message\n' + self.describe()
+            )
+
+    def _on_end(self) -> None:
+        """Note that the process has ended while something was delivered to it."""
+        allowance = Allowance(self._quiet, END)
+        while (code := self.child.returncode) is None and not allowance.is_used_up():
+            time.sleep(PERIOD)
+        if code == 0:
+            self._leave()
+            return
+        self.child.check_running(', '.join(self._stand_ins))
+        raise LockstepError(f'a node of {self.describe()}\n  has ended')
+
+    def _drop_echoes(self, end: Source | Link) -> Stage | None:
+        """Return the stage that keeps from the process what it has received directly."""
+        own = self._stand_ins.values()
+        if not isinstance(end, Link) or end.owner not in own or (TOPIC, end.topic) not in self._relays:
+            return None
+        return relays.without_echo(
+            self._scheduler.links.observers_of_published(end.topic).append,
+            lambda publisher: any(publisher in node.publishers for node in own),
+        )
+
+
+def _domains(pids: Sequence[int]) -> set[int]:
+    """Return the ROS domains in which processes receive, by their UDP ports."""
+    sockets = set()
+    for pid in pids:
+        for descriptor in Path(f'/proc/{pid}/fd').glob('*'):
+            try:
+                sockets.add(os.readlink(descriptor))
+            except OSError:
+                continue
+    found = set()
+    for line in Path('/proc/net/udp').read_text().splitlines()[1:]:
+        words = line.split()
+        port = int(words[1].rpartition(':')[2], 16)
+        # Lower ones are no ports of discovery, higher ones are given to clients.
+        if f'socket:[{words[9]}]' in sockets and 7400 <= port < 32768:
+            found.add((port - 7400) // 250)
+    return found

@@ -1,0 +1,58 @@
+"""A C++ node in a lockstep world: only where rclcpp and CMake are installed."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian.exploration.digest import MessageDigest
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.testing import Lockstep
+
+SOURCE = Path(__file__).with_name('rclcpp_controller')
+
+
+@pytest.fixture(scope='module')
+def controller(tmp_path_factory):
+    """Build the controller, and return its command."""
+    prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+    if shutil.which('cmake') is None or not any(Path(one, 'share/rclcpp').is_dir() for one in prefixes):
+        pytest.skip('rclcpp or CMake is not installed: C++ nodes are not tested')
+    folder = tmp_path_factory.mktemp('rclcpp')
+    for command in (['cmake', '-S', str(SOURCE), '-B', '.'], ['cmake', '--build', '.']):
+        subprocess.run(command, cwd=folder, check=True)
+    return [str(folder / 'controller')]
+
+
+def drive(command):
+    """Drive to a goal, with another gain on the way, and cancel. Return the hash of all messages."""
+    with Lockstep() as world, MessageDigest(world) as digest:
+        world.add(VirtualRobot())
+        world.start(command)
+        goal = PoseStamped()
+        goal.pose.position.x, goal.pose.position.y, goal.pose.orientation.w = 0.6, 0.4, 1.0
+        world.publish('goal_pose', goal)
+        world.run_for(1.0)
+        gain = Parameter('kp', value=2.0).to_parameter_msg()
+        request = SetParameters.Request(parameters=[gain])
+        assert world.call(SetParameters, 'controller/set_parameters', request).results[0].successful
+        world.run_for(4.0)
+        position = world.last('odom').pose.pose.position
+        assert math.dist((position.x, position.y), (0.6, 0.4)) < 0.01
+        assert world.call(Trigger, 'cancel').success
+        world.run_for(0.1)
+        assert world.last('cmd_vel').linear.x == 0.0
+        return digest.value()
+
+
+def test_a_node_in_cpp_does_the_same_each_time(controller):
+    assert drive(controller) == drive(controller)
