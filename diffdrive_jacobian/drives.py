@@ -27,6 +27,7 @@ from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.errors import DiffdriveError, UserError
 from diffdrive_jacobian.messages.codecs import JOINT_STATE, Wheels
 from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.topics import Selection
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -34,7 +35,6 @@ from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording
-from diffdrive_jacobian.recording.selection import Selection
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.runner import NodeRunner, Runner, discovery_off, ros_context, running
 from diffdrive_jacobian.ros.serialization import ignoring_invalid

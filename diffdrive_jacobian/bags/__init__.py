@@ -20,8 +20,7 @@ if TYPE_CHECKING:
         UncheckedError,
         recover,
     )
-    from diffdrive_jacobian.bags.run import Run, Series
-    from diffdrive_jacobian.bags.run_reader import read_run
+    from diffdrive_jacobian.bags.run import Run, Series, read_run
     from diffdrive_jacobian.bags.verification import Verification, verify
 
 __all__ = [
@@ -56,7 +55,7 @@ if not TYPE_CHECKING:
             'Series': 'bags.run',
             'UncheckedError': 'bags.recovery',
             'Verification': 'bags.verification',
-            'read_run': 'bags.run_reader',
+            'read_run': 'bags.run',
             'recover': 'bags.recovery',
             'verify': 'bags.verification',
         },

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sqlite3
+import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -12,31 +13,97 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
-from rosbags.rosbag2 import CompressionFormat, CompressionMode
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2.metadata import dump_qos_v9
+from rosbags.rosbag2.storage_mcap import McapWriter
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from ruamel.yaml import YAML
 
-from diffdrive_jacobian.bags.bag_reader import BagError, DamagedBagError, messages, open_bag
+from diffdrive_jacobian.bags import mcap
+from diffdrive_jacobian.bags.bag_reader import ROOT, BagError, DamagedBagError, messages, open_bag
+from diffdrive_jacobian.bags.bounded_reader import MAX_MESSAGE
 from diffdrive_jacobian.bags.files import REPLACED, is_journal, scratch_directory, scratch_prefix
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
-from diffdrive_jacobian.bags.limits import MAX_MESSAGE
-from diffdrive_jacobian.bags.metadata import ROOT
-from diffdrive_jacobian.bags.storage import STORAGES as STORAGES
-from diffdrive_jacobian.bags.storage import BagWriter
 from diffdrive_jacobian.bounded_yaml import MAX_SIZE
 from diffdrive_jacobian.text import format_size, printable
 
+if TYPE_CHECKING:
+    from rosbags.rosbag2.writer import StorageWriter
+
+STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+_CHUNK_CHECKSUM = 9 + 3 * 8
+"""Place of the checksum in the record of a chunk, after opcode, length, times and size."""
+_DATA_END = 9 + 4
+"""Size of the record that ends the data section and has its checksum."""
 MAX_SQLITE_PATH = 504
 """Length of the longest resolved path that SQLite opens (bytes)."""
-BAG_SUFFIXES = ('.mcap', '.db3', '.zstd', '.db3-shm', '.db3-wal', '.db3-journal')
+_BAG_SUFFIXES = ('.mcap', '.db3', '.zstd', '.db3-shm', '.db3-wal', '.db3-journal')
 """Endings of the files of a bag besides metadata.yaml."""
-REMAINDER = 10_000
+_REMAINDER = 10_000
 """Length of metadata.yaml without its topics and custom data, at most (characters)."""
-ESCAPED = 20
+_ESCAPED = 20
 """Length in YAML of a character, with its share of indentation, at most."""
 _SUM = (1 << 64) - 1
+
+
+class _CheckedMcapWriter(McapWriter):
+    """rosbags' writer, with checksums of chunks, data section and summary (mcap.dev/spec)."""
+
+    def close_chunk(self) -> None:
+        place = self.bio.tell() + _CHUNK_CHECKSUM
+        checksum = zlib.crc32(self.chunk.bio.getbuffer())
+        super().close_chunk()
+        end = self.bio.tell()
+        self.bio.seek(place)
+        self.bio.write(struct.pack('<I', checksum))
+        self.bio.seek(end)
+
+    def close(self, version: int, metadata: str) -> None:
+        super().close(version, metadata)
+        with open(self.path, 'r+b') as file:
+            footer = file.seek(-mcap.FOOTER_END.size, 2)
+            summary, *_ = mcap.FOOTER_END.unpack(file.read())
+            self._write_checksum(file, 0, summary - _DATA_END, summary - 4)
+            self._write_checksum(file, summary, footer + 16, footer + 16)
+
+    @staticmethod
+    def _write_checksum(file: BinaryIO, start: int, end: int, place: int) -> None:
+        checksum = mcap.file_checksum(file, start, end)
+        file.seek(place)
+        file.write(struct.pack('<I', checksum))
+
+
+class _SqliteWriter(Sqlite3Writer):
+    """rosbags' writer, which opens its file by the path and not by a URI.
+
+    In the URI `file:PATH` of rosbags `#`, `?` and `%` have a meaning: it would write another file.
+    """
+
+    def __init__(self, path: Path, compression: CompressionMode) -> None:
+        self.path = path.absolute() / f'{path.name}.db3'
+        self.conn = sqlite3.connect(self.path)
+        try:
+            # A bag gets its name after its files were synced. Until then it need not survive
+            # a power cut.
+            self.conn.execute('PRAGMA synchronous = OFF')
+            self.conn.execute('PRAGMA journal_mode = MEMORY')
+            self.conn.executescript(self.SQLITE_SCHEMA)
+        except BaseException:
+            self.conn.close()  # Nobody else can: there is no writer yet.
+            raise
+        self.cursor = self.conn.cursor()
+
+
+class BagWriter(Writer):
+    """rosbags' writer with these formats."""
+
+    STORAGE_PLUGINS: Mapping[StoragePlugin, type[StorageWriter]] = {
+        StoragePlugin.MCAP: _CheckedMcapWriter,
+        StoragePlugin.SQLITE3: _SqliteWriter,
+    }
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,11 +125,6 @@ class Summary:
 
 def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
     """Check that a bag can have this path, before anything is recorded for it.
-
-    Args:
-        target: The bag's directory.
-        storage: `mcap` or `sqlite3`.
-        replace: Whether it may replace another bag.
 
     Raises:
         FileExistsError: It exists, possibly as a broken symbolic link, and is not to be replaced or
@@ -91,12 +153,10 @@ def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
 
 def _is_nothing_but_a_bag(path: Path) -> bool:
     """Return whether a path is a directory with files of a bag only."""
-    if path.is_symlink() or not path.is_dir():
-        return False
-    files = list(path.iterdir())
+    files = [] if path.is_symlink() or not path.is_dir() else list(path.iterdir())
     return bool(files) and all(
         file.is_file()
-        and (file.name == 'metadata.yaml' or file.suffix in BAG_SUFFIXES)
+        and (file.name == 'metadata.yaml' or file.suffix in _BAG_SUFFIXES)
         and not is_journal(file)
         for file in files
     )
@@ -124,8 +184,8 @@ def build_bag(
         compressed: Whether the chunks of an MCAP file are compressed by zstd.
 
     Raises:
-        FileExistsError: `target` exists, and is not to be replaced or is not a bag.
-        OSError: It cannot be written, or is not read back as it was written. It is removed then.
+        OSError: As of `check_target`; or it cannot be written, or is not read back as it was written.
+            It is removed then.
     """
     check_target(target, storage, replace=replace)
     with scratch_directory(target) as scratch:
@@ -154,25 +214,24 @@ def build_bag(
 
 
 @dataclass(slots=True)
-class Content:
+class _Content:
     """Counts and checksums of messages by topic, which do not depend on the order."""
 
     counts: Counter[str] = field(default_factory=Counter)
     checksums: Counter[str] = field(default_factory=Counter)
 
     def add(self, topic: str, stamp: int, data: bytes | memoryview) -> None:
-        """Count a message and add its checksum to that of its topic."""
         self.counts[topic] += 1
         self.checksums[topic] += (zlib.crc32(data) * 0x9E3779B97F4A7C15 + stamp) & _SUM
 
 
 def _write(
     records: Iterable[Record], channels: dict[int, Channel], path: Path, storage: str, compressed: bool
-) -> tuple[Summary, Content]:
+) -> tuple[Summary, _Content]:
     writer = BagWriter(path, version=9, storage_plugin=STORAGES[storage])
     if compressed:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    content = Content()
+    content = _Content()
     try:
         writer.open()
         connections = {
@@ -209,11 +268,14 @@ def _write(
         if isinstance(error, sqlite3.Error):
             raise OSError(errno.EIO, str(error)) from error
         raise
-    topics = {channel.topic: content.counts[channel.topic] for channel in channels.values()}
     left_out = describe_too_large(too_large)
     left_out += [f'{printable(key)}: metadata.yaml would be too large' for key in unwritten]
     summary = Summary(
-        messages=sum(topics.values()), topics=topics, start=start, end=end, left_out=tuple(left_out)
+        messages=content.counts.total(),
+        topics={channel.topic: content.counts[channel.topic] for channel in channels.values()},
+        start=start,
+        end=end,
+        left_out=tuple(left_out),
     )
     return summary, content
 
@@ -242,10 +304,10 @@ def _too_large(texts: dict[str, str], connections: Iterable[Connection]) -> list
         for one in connections
         if isinstance(one.ext, ConnectionExtRosbag2)
     ]
-    if ESCAPED * (len(str(topics)) + sum(map(len, texts.values()))) + REMAINDER <= MAX_SIZE:
+    if _ESCAPED * (len(str(topics)) + sum(map(len, texts.values()))) + _REMAINDER <= MAX_SIZE:
         return []
     sizes = {key: _yaml_size({key: value}) for key, value in texts.items()}
-    excess = REMAINDER + _yaml_size(topics) + sum(sizes.values()) - MAX_SIZE
+    excess = _REMAINDER + _yaml_size(topics) + sum(sizes.values()) - MAX_SIZE
     largest = []
     for key in sorted(sizes, key=sizes.__getitem__, reverse=True):
         if excess <= 0:
@@ -264,13 +326,9 @@ def _yaml_size(content: object) -> int:
     return len(stream.getvalue())
 
 
-def _contents(path: Path) -> Content:
-    """Read a whole bag with the limits of all readers.
-
-    Raises:
-        OSError: It cannot be read.
-    """
-    content = Content()
+def _contents(path: Path) -> _Content:
+    """Read a whole bag with the limits of all readers, or raise OSError."""
+    content = _Content()
     try:
         with open_bag(path) as reader:
             for connection, stamp, data in messages(reader, reader.connections):

@@ -15,9 +15,17 @@ from typing import Any
 
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import ReaderError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
+from diffdrive_jacobian.bags.bag_reader import MetadataError, parse_parameters
 from diffdrive_jacobian.bags.bag_writer import STORAGES
-from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
+from diffdrive_jacobian.bags.bounded_reader import (
+    UNPACK_ERRORS,
+    Budget,
+    parse_bounded_qos,
+    unpack_file,
+    unpack_message,
+)
 from diffdrive_jacobian.bags.files import (
     ZSTD,
     NotABagError,
@@ -33,32 +41,80 @@ from diffdrive_jacobian.bags.journal import (
     Record,
     Text,
 )
-from diffdrive_jacobian.bags.limits import UNPACK_ERRORS, Budget, unpack_file, unpack_message
-from diffdrive_jacobian.bags.message_definitions import UnknownTypeError
-from diffdrive_jacobian.bags.metadata import MetadataError, parse_parameters
-from diffdrive_jacobian.bags.salvage_mcap import Topic, read_mcap
-from diffdrive_jacobian.bags.salvage_sqlite import read_sqlite
-from diffdrive_jacobian.bags.topic_types import definition_and_hash
+from diffdrive_jacobian.bags.message_definitions import (
+    Definition,
+    UnknownTypeError,
+    definition,
+    known_definition,
+)
+from diffdrive_jacobian.bags.salvage import Topic, read_mcap, read_sqlite
 from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
 from diffdrive_jacobian.text import printable
 
+MAX_DEFINITION = 200_000
+"""Length of the longest definition of a type that is parsed; those of ROS have less than a tenth."""
+_PARSE_ERRORS = (TypesysError, LookupError, ValueError, AssertionError, RecursionError)
 READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 LAST_ENCAPSULATION = 0x0B
 """Of CDR, in the second byte of a message; the first one is 0."""
 
 
-class DamagedBag:
-    """What is left of a bag, as records.
+def definition_and_hash(topic: Topic) -> tuple[str, str]:
+    """Return the definition of a topic's type, and the definition's hash (RIHS01).
 
-    Attributes:
-        files: The data files, in their order.
-        storage: Storage of a new bag that is like the old one, `mcap` or `sqlite3`.
-        message_count: Number of messages according to metadata.yaml; None: it has none.
-        lost: Descriptions of what could not be read; complete after all records were read.
-        unchecked: What cannot be checked, so that losses would not be noticed; complete as `lost`.
-        left_out: Topics that cannot be written, and the reasons; complete as `lost`.
+    Raises:
+        UnknownTypeError: The file lacks one of them, and the type is not known.
     """
+    known: Definition | None = None
+    try:
+        known = _known(topic.type_name)
+        reason = f'{topic.type_name} is installed in another version than it was recorded'
+    except UnknownTypeError as error:
+        reason = str(error)
+    # Where the hashes are the same, the text in the file may be damaged, or differ in comments.
+    if known is not None and (
+        topic.type_hash == known.type_hash
+        or (not topic.type_hash and topic.definition in ('', known.text))
+    ):
+        return known.text, known.type_hash
+    if topic.definition and topic.type_hash:
+        return topic.definition, topic.type_hash
+    if not topic.definition:
+        raise UnknownTypeError(reason)
+    if len(topic.definition) > MAX_DEFINITION:
+        raise UnknownTypeError(
+            f'{reason}, and its definition has {len(topic.definition)} characters; at most '
+            f'{MAX_DEFINITION} are parsed'
+        )
+    try:
+        return topic.definition, _hash(topic.definition, topic.type_name)
+    except _PARSE_ERRORS as error:
+        raise UnknownTypeError(reason) from error
+
+
+def _known(type_name: str) -> Definition:
+    """Return the definition of an installed type, or of one that is known without ROS."""
+    try:
+        return definition(type_name)
+    except UnknownTypeError:
+        with suppress(UnknownTypeError):
+            return known_definition(type_name)
+        raise
+
+
+def _hash(text: str, type_name: str) -> str:
+    """Return the hash of a definition.
+
+    It is only parsed. rosbags' `register` would generate code from it and execute that.
+    """
+    store = get_typestore(Stores.EMPTY)
+    store.fielddefs.update(get_types_from_msg(text, type_name))
+    return store.hash_rihs01(type_name)
+
+
+class DamagedBag:
+    """What is left of a bag, as records."""
 
     def __init__(self, path: Path, scratch: Path) -> None:
         """Find the files, and decompress those that are compressed.
@@ -72,19 +128,25 @@ class DamagedBag:
             OSError: It cannot be read.
         """
         self.path = path
-        self.files = bag_files(path)
-        self.storage = file_kind(self.files[0])
+        files = bag_files(path)
+        self.storage = file_kind(files[0])
+        """Storage of a new bag that is like the old one, `mcap` or `sqlite3`."""
         self.lost: list[str] = []
+        """Descriptions of what could not be read. This and the next two are complete after all records
+        were read."""
         self.unchecked: list[str] = []
+        """What cannot be checked, so that losses would not be noticed."""
         self.left_out: dict[str, str] = {}
+        """Topics that cannot be written, and the reasons."""
         folder = path if path.is_dir() else path.parent
         self._metadata, self._problem = _metadata(folder / 'metadata.yaml')
         listed = _listed(self._metadata)
-        self._missing = listed - {file.name for file in self.files}
+        self._missing = listed - {file.name for file in files}
         if path.is_file() and (self._missing or not listed):
             self._metadata, self._missing = {}, set()
         self.message_count = self._metadata.get('message_count')
-        self._sources = [(file.name, _unpacked(file, scratch)) for file in self.files]
+        """Number of messages according to metadata.yaml; None: it has none."""
+        self._sources = [(file.name, _unpacked(file, scratch)) for file in files]
 
     @property
     def losses(self) -> list[str]:
@@ -115,7 +177,7 @@ class DamagedBag:
         source, metadata = 'metadata.yaml', self._metadata
         if not isinstance(self.message_count, int):
             source, metadata = 'the copy of metadata.yaml', self._copy
-            if not len(self.files) == len(_listed(metadata)) == 1:
+            if not len(self._sources) == len(_listed(metadata)) == 1:
                 # The copies in several files count what was written before them.
                 metadata = {}
         if self.path.is_dir() and not (metadata is self._metadata and _listed(metadata)):
@@ -123,8 +185,17 @@ class DamagedBag:
                 'there is no valid metadata.yaml, so files that are missing, or of another recording, '
                 'cannot be noticed'
             )
-            self._compare_times()
-        seen, counts = self._seen, _counts_by_topic(metadata)
+            # The parts of one recording follow one another.
+            self.unchecked += [
+                f'{second} begins before {first} ends: they may be of two recordings, or the same '
+                'messages twice'
+                for (_, end, first), (start, _, second) in pairwise(sorted(self._times))
+                if start < end
+            ]
+        seen, counts = self._seen, Counter[str]()
+        for described, number in _described_topics(metadata):
+            if isinstance(number, int):
+                counts[str(described.get('name'))] += number
         count = metadata.get('message_count')
         pairs = [(count, seen.total())] if isinstance(count, int) else []
         pairs += [(number, seen[topic]) for topic, number in counts.items()]
@@ -138,15 +209,6 @@ class DamagedBag:
             difference += f' ({topics})' if topics else ''
             fewer = any(number > found for number, found in pairs)
             (self.lost if fewer else self.unchecked).append(difference)
-
-    def _compare_times(self) -> None:
-        """Report files that cannot be parts of one recording, which follow one another."""
-        for (_, end, first), (start, _, second) in pairwise(sorted(self._times)):
-            if start < end:
-                self.unchecked.append(
-                    f'{second} begins before {first} ends: they may be of two recordings, or the same '
-                    'messages twice'
-                )
 
     def _compare_descriptions(self) -> None:
         """Compare metadata.yaml with the topics in the files, and with its copy there."""
@@ -206,13 +268,11 @@ class DamagedBag:
                     self.lost += [f'{name}: {problem}'] if problem else []
                     for text in _custom_data(metadata):
                         yield from self._text(text)
-                    continue
-                if isinstance(one, Text):
+                elif isinstance(one, Text):
                     if one.key == 'storage' and one.value in STORAGES:
                         self.storage = one.value
                     yield from self._text(one)
-                    continue
-                if isinstance(one, Topic):
+                elif isinstance(one, Topic):
                     known = channels.get((one.name, one.type_name))
                     channel = self._channel(one, channels)
                     ids[one.id] = None if channel is None else channel.id
@@ -221,17 +281,17 @@ class DamagedBag:
                         self._hashes[one.name, one.type_name] = one.type_hash
                     if channel is not None and channel != known:
                         yield channel
-                    continue
-                self._seen[names.get(one.channel, '')] += 1
-                if one.channel not in ids:
-                    faults['belong to no known topic'] += 1
-                elif (to := ids[one.channel]) is not None:
-                    data = _payload(one.data, budget)
-                    if data is None or not 0 <= one.stamp < 2**63:
-                        faults['are not CDR, are too large, or have an invalid time'] += 1
-                    else:
-                        start, end = min(start, one.stamp), max(end, one.stamp)
-                        yield Message(to, one.stamp, data)
+                else:
+                    self._seen[names.get(one.channel, '')] += 1
+                    if one.channel not in ids:
+                        faults['belong to no known topic'] += 1
+                    elif (to := ids[one.channel]) is not None:
+                        data = _payload(one.data, budget)
+                        if data is None or not 0 <= one.stamp < 2**63:
+                            faults['are not CDR, are too large, or have an invalid time'] += 1
+                        else:
+                            start, end = min(start, one.stamp), max(end, one.stamp)
+                            yield Message(to, one.stamp, data)
         self._times += [(start, end, name)] if end >= 0 else []
         self.lost += [f'{name}: {count} messages {what}' for what, count in faults.items()]
 
@@ -287,10 +347,9 @@ def _unpacked(file: Path, scratch: Path) -> Path:
 
 
 def _metadata(source: Path | str) -> tuple[dict[str, Any], str]:
-    """Read metadata.yaml, or its text in a data file.
+    """Return the content of metadata.yaml or of its text, {} if it is missing or damaged.
 
-    Returns:
-        The content, empty if it is missing or damaged, and the reason if it was not read at all.
+    And the reason if it was not read at all.
     """
     try:
         if isinstance(source, Path):
@@ -308,15 +367,6 @@ def _listed(metadata: dict[str, Any]) -> set[str]:
     """Return the names of the data files that metadata.yaml lists."""
     paths = metadata.get('relative_file_paths')
     return {Path(str(name)).name for name in paths} if isinstance(paths, list) else set()
-
-
-def _counts_by_topic(metadata: dict[str, Any]) -> Counter[str]:
-    """Return the numbers of messages in metadata.yaml, of the topics that it describes as it should."""
-    counts: Counter[str] = Counter()
-    for described, count in _described_topics(metadata):
-        if isinstance(count, int):
-            counts[str(described.get('name'))] += count
-    return counts
 
 
 def _described_topics(metadata: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Any]]:

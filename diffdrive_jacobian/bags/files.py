@@ -21,6 +21,12 @@ from diffdrive_jacobian.errors import DiffdriveError
 
 REPLACED = 'replaced'
 """Name of the bag that is replaced, while the new one takes its place."""
+JOURNAL = '.journal.mcap'
+"""Ends the name of a journal, after the name of the bag."""
+SQLITE_MAGIC = b'SQLite format 3\0'
+ZSTD = '.zstd'
+_KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3'}
+_MAGICS = {mcap.MAGIC: 'mcap', SQLITE_MAGIC: 'sqlite3'}
 
 
 def scratch_prefix(target: Path) -> str:
@@ -67,14 +73,6 @@ def _remove_remains(target: Path) -> None:
                 shutil.rmtree(path, ignore_errors=True)
             finally:
                 os.close(descriptor)
-
-
-JOURNAL = '.journal.mcap'
-"""Ends the name of a journal, after the name of the bag."""
-SQLITE_MAGIC = b'SQLite format 3\0'
-ZSTD = '.zstd'
-_KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3'}
-_MAGICS = {mcap.MAGIC: 'mcap', SQLITE_MAGIC: 'sqlite3'}
 
 
 class NotARegularFileError(DiffdriveError, OSError):

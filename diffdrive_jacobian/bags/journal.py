@@ -90,16 +90,13 @@ class _Chunk:
         self._pieces: list[bytes] = []
         self._start, self._end = 2**64 - 1, 0
 
-    def add(self, described: bytes) -> None:
-        self._pieces.append(described)
-        self.size += len(described)
+    def add(self, *pieces: bytes) -> None:
+        # Kept as they are: large messages are not copied before they are written.
+        self._pieces += pieces
+        self.size += sum(map(len, pieces))
 
-    def add_message(self, head: bytes, data: bytes, stamp: int) -> None:
-        # The data is kept as it is: large messages are not copied before they are written.
-        self._pieces += (head, data)
-        self.size += len(head) + len(data)
-        self._start = min(self._start, stamp)
-        self._end = max(self._end, stamp)
+    def add_stamp(self, stamp: int) -> None:
+        self._start, self._end = min(self._start, stamp), max(self._end, stamp)
 
     def pack(self) -> bytes:
         """Return the record."""
@@ -113,10 +110,6 @@ class _Chunk:
         return b''.join((_CHUNK.pack(*fields), *self._pieces))
 
 
-def _header() -> bytes:
-    return mcap.MAGIC + mcap.record(mcap.HEADER, mcap.text('ros2'), mcap.text(LIBRARY))
-
-
 def _attachment(entry: Text) -> bytes:
     times, data = bytes(16), entry.value.encode()
     size = mcap.number(len(data), 8)
@@ -126,16 +119,13 @@ def _attachment(entry: Text) -> bytes:
 
 def _topic(number: int, channel: Channel) -> bytes:
     """Return the records that describe a topic and its type."""
-    schema, index = mcap.number(number, 2), mcap.number(number, 2)
+    index = mcap.number(number, 2)
     profiles = StringIO()
     YAML(typ='safe').dump(dump_qos_v9(list(channel.qos)), profiles)
     texts = (channel.type_name, 'ros2msg', channel.definition)
-    extra = {
-        'offered_qos_profiles': profiles.getvalue(),
-        'topic_type_hash': channel.type_hash,
-    }
-    return mcap.record(mcap.SCHEMA, schema, *map(mcap.text, texts)) + mcap.record(
-        mcap.CHANNEL, index, schema, mcap.text(channel.topic), mcap.text('cdr'), mcap.texts(extra)
+    extra = {'offered_qos_profiles': profiles.getvalue(), 'topic_type_hash': channel.type_hash}
+    return mcap.record(mcap.SCHEMA, index, *map(mcap.text, texts)) + mcap.record(
+        mcap.CHANNEL, index, index, mcap.text(channel.topic), mcap.text('cdr'), mcap.texts(extra)
     )
 
 
@@ -157,7 +147,8 @@ class JournalWriter:
             fcntl.flock(self._file, fcntl.LOCK_EX)
         self._lock = threading.Lock()
         # Records that cannot be in a chunk.
-        self._records = [_header()]
+        head = mcap.record(mcap.HEADER, mcap.text('ros2'), mcap.text(LIBRARY))
+        self._records = [mcap.MAGIC + head]
         self._chunks = [_Chunk()]
         self._numbers: dict[int, int] = {}
         self._topics = self._messages = 0
@@ -179,7 +170,14 @@ class JournalWriter:
         """
         with self._lock:
             if isinstance(record, Message):
-                size = self._add_message(record)
+                length, stamp = mcap.MESSAGE_HEAD.size + len(record.data), record.stamp
+                channel = self._numbers[record.channel]
+                self._messages += 1
+                head = _MESSAGE.pack(mcap.MESSAGE, length, channel, self._messages, stamp, stamp)
+                chunk = self._chunk(length)
+                chunk.add(head, record.data)
+                chunk.add_stamp(stamp)
+                size = mcap.HEAD.size + length
             elif isinstance(record, Channel):
                 # With other profiles it is another channel of MCAP, of the same topic.
                 self._topics += 1
@@ -192,16 +190,6 @@ class JournalWriter:
                 size = len(self._records[-1])
             self._added += size
             self.waiting += OVERHEAD + size
-
-    def _add_message(self, message: Message) -> int:
-        """Add a message, and return its size."""
-        length, stamp = mcap.MESSAGE_HEAD.size + len(message.data), message.stamp
-        number = self._messages + 1
-        channel = self._numbers[message.channel]
-        head = _MESSAGE.pack(mcap.MESSAGE, length, channel, number, stamp, stamp)
-        self._messages = number
-        self._chunk(length).add_message(head, message.data, stamp)
-        return mcap.HEAD.size + length
 
     def _chunk(self, size: int) -> _Chunk:
         """Return the chunk of the next record, which has this size."""

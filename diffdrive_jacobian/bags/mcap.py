@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import zlib
+from typing import BinaryIO
 
 MAGIC = b'\x89MCAP0\r\n'
 """At the beginning and at the end of a file."""
@@ -13,6 +15,9 @@ HEAD = struct.Struct('<BQ')
 """Before the fields of a record: its opcode and their length."""
 MESSAGE_HEAD = struct.Struct('<HIQQ')
 """Before the data of a message: its channel, its number, and when it was received and sent (ns)."""
+FOOTER_END = struct.Struct('<QQI8s')
+"""Start of the summary and of its offsets, checksum of the summary, and the magic."""
+_BLOCK = 1 << 20
 
 
 def record(opcode: int, *fields: bytes) -> bytes:
@@ -76,3 +81,13 @@ class Cursor:
             key = inner.text()
             found[key] = inner.text()
         return found
+
+
+def file_checksum(file: BinaryIO, start: int, end: int) -> int:
+    """Return the CRC-32 of a part of a file."""
+    checksum = 0
+    file.seek(min(start, end))
+    while start < end and (block := file.read(min(end - start, _BLOCK))):
+        checksum = zlib.crc32(block, checksum)
+        start += len(block)
+    return checksum

@@ -11,20 +11,28 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Connection
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.interfaces import Connection, Nodetype
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.names import import_type
-from diffdrive_jacobian.messages.structure import Structure, defined
+from diffdrive_jacobian.messages.structure import (
+    CODES,
+    Array,
+    FieldType,
+    Number,
+    Sequence,
+    Structure,
+    Text,
+)
 from diffdrive_jacobian.text import printable
 
 GOALS = 'nav_msgs/msg/Goals'
@@ -32,7 +40,17 @@ GOALS_DEFINITION = """std_msgs/Header header
 geometry_msgs/PoseStamped[] goals
 """
 """The only type of ROS 2 Jazzy that is read here and that rosbags lacks."""
+_NUMBERS = {'bool': 'boolean', 'byte': 'octet', 'char': 'uint8', 'float32': 'float', 'float64': 'double'}
+"""Types of numbers in .msg files to their names in rosidl, where these differ."""
+_NONE = 'structure_needs_at_least_one_member'
+"""The only field of a message without fields, as rosbags has it."""
 _HASH = re.compile('RIHS01_[0-9a-f]{64}')
+DELIMITER = '=' * 80
+_NAME = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9_]*)')
+_LIBRARIES = (('lib',), ('lib64',), ('local', 'lib'), ('Lib',))
+"""Directories of Python packages, relative to a prefix."""
+_FIELD = re.compile(r'^\s*([A-Za-z]\w*(?:/[A-Za-z]\w*)?)(?:<=\d+)?(?:\[[^]]*\])?\s+[A-Za-z]\w*')
+_PRIMITIVE = re.compile(r'bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string')
 
 
 @cache
@@ -49,10 +67,7 @@ def is_known(type_name: str) -> bool:
 
 @cache
 def known_definition(type_name: str) -> Definition:
-    """Return the definition of a type that is known without ROS.
-
-    Args:
-        type_name: `package/msg/Name`.
+    """Return the definition of a type (`package/msg/Name`) that is known without ROS.
 
     Raises:
         UnknownTypeError: It is not known.
@@ -71,37 +86,60 @@ def known_structure(type_name: str) -> Structure:
     Raises:
         UnknownTypeError: It is not known.
     """
-    return defined(type_name, known_definition(type_name).text)
+    if not is_known(type_name):
+        raise UnknownTypeError(f'{printable(type_name)} is not a type of ROS 2 Jazzy')
+    return _structure(_typestore().fielddefs, type_name)
+
+
+def installed_structure(type_name: str) -> Structure:
+    """Return the types of the fields of an installed message type.
+
+    Raises:
+        UnknownTypeError: No installed package defines it, or its files are invalid.
+    """
+    text = definition(type_name).text
+    try:
+        return _structure(get_types_from_msg(text, type_name), type_name)
+    except (TypesysError, LookupError, RecursionError) as error:
+        raise UnknownTypeError(
+            f'the installed definition of {type_name} is invalid: {printable(repr(error))}'
+        ) from error
+
+
+def _structure(definitions: Mapping[str, Any], name: str) -> Structure:
+    """Return the types of the fields of a message from definitions that rosbags has parsed."""
+
+    def field(described: Any) -> FieldType:
+        node, content = described
+        if node == Nodetype.NAME:
+            return _structure(definitions, content)
+        kind, count = content
+        if node == Nodetype.ARRAY:
+            return Array(field(kind), count)
+        if node == Nodetype.SEQUENCE:
+            return Sequence(field(kind), count or None)
+        if kind in ('string', 'wstring'):
+            return Text(kind == 'wstring', count or None)
+        return Number(CODES[_NUMBERS.get(kind, kind)])
+
+    _, fields = definitions[name]
+    own = ((field_name, field(described)) for field_name, described in fields if field_name != _NONE)
+    return Structure(name.replace('/msg/', '/'), tuple(own))
 
 
 def recorded_definition_differs(type_name: str, type_hashes: Iterable[str]) -> bool:
-    """Return whether a type was recorded with another definition than the known one.
+    """Return whether a known type was recorded with another definition, by its hashes in a bag.
 
-    Args:
-        type_name: `package/msg/Name`; it is known.
-        type_hashes: Hashes that a bag has for it. Those that are empty or no RIHS01 hash do not count.
+    Hashes that are empty or no RIHS01 hash do not count.
     """
     known = _typestore().hash_rihs01(type_name)
     return any(_HASH.fullmatch(one) and one != known for one in type_hashes)
 
 
 def type_hashes(connection: Connection, stored: Iterable[Connection]) -> list[str]:
-    """Return what a bag says about the hash of a topic's type: in metadata.yaml and in its data files.
-
-    Args:
-        connection: The topic, as metadata.yaml has it.
-        stored: The topics of the data files.
-    """
+    """Return the hashes of a topic's type in metadata.yaml and in the data files (`stored`)."""
     alike = (one for one in stored if (one.topic, one.msgtype) == (connection.topic, connection.msgtype))
     return [str(one.digest) for one in (connection, *alike)]
-
-
-DELIMITER = '=' * 80
-_NAME = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9_]*)')
-_LIBRARIES = (('lib',), ('lib64',), ('local', 'lib'), ('Lib',))
-"""Directories of Python packages, relative to a prefix."""
-_FIELD = re.compile(r'^\s*([A-Za-z]\w*(?:/[A-Za-z]\w*)?)(?:<=\d+)?(?:\[[^]]*\])?\s+[A-Za-z]\w*')
-_PRIMITIVE = re.compile(r'bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string')
 
 
 class UnknownTypeError(DiffdriveError):
@@ -122,10 +160,7 @@ class Definition:
 
 @cache
 def definition(name: str) -> Definition:
-    """Return the definition of an installed message type.
-
-    Args:
-        name: `package/msg/Name`.
+    """Return the definition of an installed message type (`package/msg/Name`).
 
     Raises:
         UnknownTypeError: No installed package defines it, or its files are invalid.
@@ -144,10 +179,7 @@ def definition(name: str) -> Definition:
 
 @cache
 def message_class(name: str) -> Any:
-    """Return the Python class of a message type.
-
-    Args:
-        name: `package/msg/Name`.
+    """Return the Python class of a message type (`package/msg/Name`).
 
     Raises:
         UnknownTypeError: No installed package defines it, or its Python code or its type support is not
@@ -164,17 +196,8 @@ def message_class(name: str) -> Any:
         raise UnknownTypeError(
             f'the Python code of {name} cannot be imported: {printable(repr(error))}'
         ) from error
-    _load_type_support(name, found)
-    return found
-
-
-def _load_type_support(name: str, found: Any) -> None:
-    """Load the type support of a message class, as rclpy does when it creates a subscription.
-
-    Raises:
-        UnknownTypeError: It is not installed or cannot be loaded.
-    """
-    kind = type(found)
+    # As rclpy does when it creates a subscription.
+    kind: Any = type(found)
     try:
         if kind._TYPE_SUPPORT is None:
             kind.__import_type_support__()
@@ -186,12 +209,12 @@ def _load_type_support(name: str, found: Any) -> None:
         ) from error
     if missing:
         raise UnknownTypeError(f'the type support of {name} is not installed')
+    return found
 
 
 def _split(name: str) -> tuple[str, str]:
     """Return package and message of a valid name of a message type."""
-    match = _NAME.fullmatch(name)
-    if match is None:
+    if (match := _NAME.fullmatch(name)) is None:
         raise UnknownTypeError(
             f'a message type must be named package/msg/Name, got {printable(repr(name))}'
         )
@@ -211,14 +234,8 @@ def _full_text(package: str, message: str, seen: set[tuple[str, str]]) -> str:
 
 
 def _dependencies(package: str, text: str) -> set[tuple[str, str]]:
-    found = set()
-    for line in text.splitlines():
-        match = _FIELD.match(line)
-        if match is None or _PRIMITIVE.fullmatch(match.group(1)):
-            continue
-        owner, _, name = match.group(1).rpartition('/')
-        found.add((owner or package, name))
-    return found
+    types = (match[1].rpartition('/') for match in map(_FIELD.match, text.splitlines()) if match)
+    return {(owner or package, name) for owner, _, name in types if not _PRIMITIVE.fullmatch(name)}
 
 
 def _file(package: str, message: str, ending: str) -> Path:

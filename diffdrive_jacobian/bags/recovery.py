@@ -6,6 +6,7 @@ import json
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -22,79 +23,34 @@ from diffdrive_jacobian.bags.journal import (
     Channel,
     Message,
     Record,
-    Text,
     is_being_written,
 )
-from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, known_definition
+from diffdrive_jacobian.bags.message_definitions import (
+    UnknownTypeError,
+    definition,
+    installed_structure,
+    known_definition,
+    known_structure,
+)
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
-from diffdrive_jacobian.messages.structure import DefinitionError, defined
 from diffdrive_jacobian.text import printable
 
 Decoder = Callable[[bytes], Any]
 """Decodes a message, or raises DecodingError."""
-
-
-class DecodingCheck:
-    """Counts, by topic, the messages that readers cannot decode.
-
-    Types of ROS 2 Jazzy are checked without ROS, others if their package is installed as it was
-    recorded.
-    """
-
-    def __init__(self) -> None:
-        """Start without messages."""
-        self._total: Counter[str] = Counter()
-        self._failed: Counter[str] = Counter()
-        self._unchecked: set[str] = set()
-        self._decoders: dict[tuple[str, str], Decoder | None] = {}
-
-    def add(self, channel: Channel, data: bytes) -> None:
-        """Check a message of a channel."""
-        key = channel.type_name, channel.type_hash
-        if key not in self._decoders:
-            self._decoders[key] = _decoder(channel)
-        decoder = self._decoders[key]
-        self._total[channel.topic] += 1
-        if decoder is None:
-            self._unchecked.add(channel.topic)
-            return
-        try:
-            decoder(data)
-        except DecodingError:
-            self._failed[channel.topic] += 1
-
-    @property
-    def undecodable(self) -> list[str]:
-        """Description of the messages that cannot be decoded, and of topics that were not checked."""
-        found = [
-            f'{count} of {self._total[topic]} messages on {printable(topic)} cannot be decoded'
-            for topic, count in self._failed.items()
-        ]
-        found += [
-            f'the {self._total[topic]} messages on {printable(topic)} were not checked: their type '
-            'is not installed as it was recorded'
-            for topic in sorted(self._unchecked)
-        ]
-        return found
+RECOVERED = '_recovered'
+"""Ends the name of a recovered bag."""
 
 
 def _decoder(channel: Channel) -> Decoder | None:
     """Return a function that decodes the messages of a channel; None: its definition is not known."""
     name = channel.type_name
-    for known in (known_definition, definition):
-        try:
-            found = known(name)
-            if found.type_hash == channel.type_hash:
-                return Reader(defined(name, found.text), (), bounded=False)
-        except (UnknownTypeError, DefinitionError, TypeError):
-            # The type is not installed, or has what is not read here.
-            continue
+    for known, types in ((known_definition, known_structure), (definition, installed_structure)):
+        # The type is not installed, or has what is not read here.
+        with suppress(UnknownTypeError, TypeError):
+            if known(name).type_hash == channel.type_hash:
+                return Reader(types(name), (), bounded=False)
     return None
-
-
-RECOVERED = '_recovered'
-"""Ends the name of a recovered bag."""
 
 
 class NothingToSaveError(DiffdriveError):
@@ -178,7 +134,7 @@ def recover(
 
         survey = _Survey(records())
         lost, unchecked, left_out = tuple(old.losses), tuple(old.unchecked), bool(old.left_out)
-        undecodable = tuple(survey.decoding.undecodable)
+        undecodable = survey.undecodable
         # A journal is no bag, whole as it may be.
         damaged = '' if is_journal(what) else find_damage(what)
         count = survey.kinds[Message]
@@ -217,22 +173,56 @@ def recover(
 
 
 class _Survey:
-    """Topics, number of records by their kind, messages that cannot be decoded, and noted losses."""
+    """Topics, number of records by their kind, noted losses, and messages that cannot be decoded.
+
+    Types of ROS 2 Jazzy are decoded without ROS, others if their package is installed as it was
+    recorded.
+    """
 
     def __init__(self, records: Iterable[Record]) -> None:
         self.kinds: Counter[type[Record]] = Counter()
-        self.decoding = DecodingCheck()
         self.notes: dict[str, str] = {}
         """The custom data of the keys `LOST` and `LEFT_OUT`."""
         self.channels: dict[int, Channel] = {}
+        self._messages: Counter[str] = Counter()
+        self._undecodable: Counter[str] = Counter()
+        self._unchecked: set[str] = set()
+        decoders: dict[tuple[str, str], Decoder | None] = {}
         for record in records:
             self.kinds[type(record)] += 1
             if isinstance(record, Channel):
                 self.channels[record.id] = record
+                key = record.type_name, record.type_hash
+                if key not in decoders:
+                    decoders[key] = _decoder(record)
             elif isinstance(record, Message):
-                self.decoding.add(self.channels[record.channel], record.data)
-            elif isinstance(record, Text) and record.key in (LOST, LEFT_OUT):
+                channel = self.channels[record.channel]
+                self._messages[channel.topic] += 1
+                decoder = decoders[channel.type_name, channel.type_hash]
+                if decoder is None:
+                    self._unchecked.add(channel.topic)
+                    continue
+                try:
+                    decoder(record.data)
+                except DecodingError:
+                    self._undecodable[channel.topic] += 1
+            elif record.key in (LOST, LEFT_OUT):
                 self.notes[record.key] = record.value
+
+    @property
+    def undecodable(self) -> tuple[str, ...]:
+        """Descriptions of messages that cannot be decoded, and of topics that were not checked."""
+        return (
+            *(
+                f'{count} of {self._messages[topic]} messages on {printable(topic)} cannot be decoded'
+                for topic, count in self._undecodable.items()
+            ),
+            *(
+                f'the {self._messages[topic]} messages on {printable(topic)} were not checked: their '
+                'type is not installed as it was recorded'
+                for topic in sorted(self._unchecked)
+            ),
+        )
 
 
 def _lost_before(notes: dict[str, str]) -> tuple[str, ...]:
@@ -260,7 +250,6 @@ def _lost_before(notes: dict[str, str]) -> tuple[str, ...]:
 
 
 def _default_target(what: Path) -> Path:
-    """Return the directory of the new bag, named after the old one."""
     if is_journal(what):
         return what.with_name(what.name.removesuffix(JOURNAL))
     stem = what.stem if what.is_file() else what.resolve().name

@@ -1,4 +1,4 @@
-"""A recorded run as NumPy arrays.
+"""Recorded runs as NumPy arrays, and their reading.
 
 `print(run)` and `print(run.odometry)` give a summary; the numbers are in `run.odometry.values`, whose
 columns are named in `run.odometry.columns`.
@@ -7,16 +7,36 @@ columns are named in `run.odometry.columns`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Reader
 
-from diffdrive_jacobian.bags.bag_reader import BagError
-from diffdrive_jacobian.messages.topics import TOPICS
+from diffdrive_jacobian.bags.bag_reader import (
+    BagError,
+    ReadingInterruptedError,
+    messages,
+    open_bag,
+    recorded_parameters,
+    stored_connections,
+)
+from diffdrive_jacobian.bags.message_definitions import (
+    known_structure,
+    recorded_definition_differs,
+    type_hashes,
+)
+from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError
+from diffdrive_jacobian.messages.codecs import Changes, FaultEvent
+from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.names import base_name, namespace_of
+from diffdrive_jacobian.messages.topics import READABLE, TOPICS, Topic
+from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_NUMBER = 1e6
@@ -25,6 +45,8 @@ COLUMNS = {topic.series: topic.columns for topic in TOPICS.values() if topic.ser
 """Columns of the values of each series of a `Run`."""
 _CONTROLLER = {'controller', 'use_goal_heading', 'xy_goal_tolerance'}
 """Parameters by which a go_to_goal of another name is known."""
+WHEELS = ('left_wheel_joint', 'right_wheel_joint')
+"""Names of the left and the right wheel joint where no parameters give them."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, repr=False)
@@ -128,10 +150,7 @@ class Run:
         return found[0] if len(found) == 1 else {}
 
     def configurations(self) -> Iterator[tuple[int, Run]]:
-        """Yield the run with the parameters of each time, and since when they are valid (ns).
-
-        Those of the beginning are valid since 0.
-        """
+        """Yield the run with the parameters of each time, and since when they are valid (ns), from 0."""
         run, since = self, 0
         yield since, run
         for received, node, values in self.parameter_events:
@@ -151,3 +170,201 @@ def number(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= MAX_NUMBER:
         return math.nan
     return float(value)
+
+
+# --- Reading
+
+
+def read_run(
+    path: str | Path,
+    topics: Mapping[str, str] | None = None,
+    *,
+    namespace: str | None = None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> Run:
+    """Read a bag that `record_run` or `ros2 bag record` has written.
+
+    Messages that cannot be decoded, and those that the nodes drop, are skipped. `Run.skipped` counts
+    them and `Run.notes` describes them.
+
+    Args:
+        path: The bag's directory, or an MCAP or SQLite file.
+        topics: Topics with another name in the bag: from the usual name, such as `odom`, to the name in
+            the bag, such as `/robot1/odom`. By default topics are found by their name without namespace.
+        namespace: Namespace of the robot, such as `/robot1`, in a bag of several. Only its topics and
+            nodes are read, and topics that are given. None: that of the only robot.
+        interrupted: Is called for each message; once it returns True, reading ends.
+
+    Raises:
+        ReadingInterruptedError: `interrupted` returned True.
+        BagError: It is not a bag, is damaged, has several topics of the same name, or none in the
+            namespace.
+    """
+    path = Path(path)
+    rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = defaultdict(list)
+    events: list[tuple[int, str, dict[str, Any]]] = []
+    event_stamps: list[int] = []
+    fault_events: list[tuple[int, str, str]] = []
+    with open_bag(path) as reader:
+        parameters = {
+            node: values
+            for node, values in recorded_parameters(reader).items()
+            if namespace in (None, namespace_of(node))
+        }
+        names = _wheel_names(parameters)
+        chosen = _choose(reader, dict(topics or {}), namespace)
+        connections = [one for one in reader.connections if one.id in chosen]
+        tally = _Tally()
+        stored = stored_connections(reader)
+        foreign = {
+            one.id
+            for one in connections
+            if recorded_definition_differs(one.msgtype, type_hashes(one, stored))
+        }
+        readers = {
+            one.id: chosen[one.id].codec(one.msgtype).reader(known_structure(one.msgtype))
+            for one in connections
+        }
+        for connection, received, data in messages(reader, connections, tally.invalid):
+            if interrupted():
+                raise ReadingInterruptedError
+            topic = chosen[connection.id]
+            tally.read[connection.topic] += 1
+            if connection.id in foreign:
+                tally.foreign[connection.topic] += 1
+                continue
+            try:
+                value = readers[connection.id](data)
+                if isinstance(value, Changes):
+                    if namespace in (None, namespace_of(value.node)):
+                        events.append((received, value.node, value.values))
+                        event_stamps.append(value.stamp)
+                elif isinstance(value, FaultEvent):
+                    fault_events.append((received, value.fault, value.what))
+                else:
+                    rows[topic.series] += [
+                        (received, stamp or received, row) for stamp, row in topic.rows(value, names)
+                    ]
+            except LongMessageError:
+                tally.refused[connection.topic] += 1
+            except DecodingError:
+                tally.undecodable[connection.topic] += 1
+            except MessageError:
+                # The nodes drop it as well.
+                tally.refused[connection.topic] += 1
+        notes = tally.notes(connections)
+    series, covariances = {}, {}
+    for topic in TOPICS.values():
+        if topic.series in series or not topic.series:
+            continue
+        found, count = rows[topic.series], len(topic.columns)
+        values = np.array([row for *_, row in found], dtype=np.float64)
+        values = values.reshape(len(found), count + len(topic.covariances))
+        covariances[topic.series] = values[:, count:].copy()
+        series[topic.series] = Series(
+            received=np.array([received for received, *_ in found], dtype=np.int64),
+            stamps=np.array([stamp for _, stamp, _ in found], dtype=np.int64),
+            values=values[:, :count].copy(),
+            columns=topic.columns,
+        )
+    return Run(
+        path=path,
+        odometry_covariances=covariances['odometry'],
+        start_covariances=covariances['start_pose'],
+        parameters=parameters,
+        parameter_events=tuple(events),
+        parameter_stamps=tuple(event_stamps),
+        fault_events=tuple(fault_events),
+        skipped=dict(tally.skipped),
+        notes=notes,
+        **series,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Tally:
+    """Counts of messages by the name of their topic in the bag."""
+
+    read: Counter[str] = field(default_factory=Counter)
+    invalid: Counter[str] = field(default_factory=Counter)
+    """Messages without a valid time or bytes, which `messages` leaves out; they are not in `read`."""
+    foreign: Counter[str] = field(default_factory=Counter)
+    """Messages of a type that was recorded with another definition than the known one."""
+    undecodable: Counter[str] = field(default_factory=Counter)
+    refused: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def skipped(self) -> Counter[str]:
+        return self.invalid + self.foreign + self.undecodable + self.refused
+
+    def notes(self, connections: Sequence[Connection]) -> tuple[str, ...]:
+        """Return descriptions of messages that were skipped or are missing, by topic."""
+        found = self.read + self.invalid
+        expected: Counter[str] = Counter()
+        types: dict[str, str] = {}
+        for connection in connections:
+            expected[connection.topic] += connection.msgcount
+            types[connection.topic] = connection.msgtype
+        lines = []
+        for topic in sorted(expected):
+            for count, why in (
+                (self.foreign[topic], f'were recorded with another definition of {types[topic]}'),
+                (self.invalid[topic] + self.undecodable[topic], 'cannot be decoded'),
+                (self.refused[topic], 'hold invalid or implausible values'),
+            ):
+                if count:
+                    of = f'{count} of {found[topic]} messages on {printable(topic)}'
+                    lines.append(f'{of} {why} and were skipped')
+            if found[topic] != expected[topic]:
+                lines.append(
+                    f'{found[topic]} messages on {printable(topic)} were found, '
+                    f'the bag should have {expected[topic]}'
+                )
+        return tuple(lines)
+
+
+def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dict[int, Topic]:
+    """Return which connections are which topics of a run, by the id of the connection."""
+    chosen: dict[int, Topic] = {}
+    if unknown := sorted(set(given) - READABLE.keys()):
+        raise BagError(f'topics must be among {", ".join(sorted(READABLE))}, got {unknown[0]!r}')
+    for name, topic in sorted(READABLE.items()):
+        matching = [
+            one
+            for one in reader.connections
+            if one.msgtype in topic.types
+            and (
+                one.topic == given[name]
+                if name in given
+                else base_name(one.topic) == name
+                and (topic.shared or namespace in (None, namespace_of(one.topic)))
+            )
+        ]
+        if name in given and not matching:
+            raise BagError(
+                f'{reader.path} has no topic {given[name]} of {" or ".join(sorted(topic.types))}; '
+                f'it has {", ".join(sorted({one.topic for one in reader.connections})) or "none"}'
+            )
+        if len(names := {one.topic for one in matching}) > 1:
+            raise BagError(
+                f'{reader.path} has several topics {name}: {", ".join(sorted(names))}; '
+                'choose one of them, or one namespace (--namespace)'
+            )
+        chosen.update((one.id, topic) for one in matching)
+    if namespace is not None and all(topic.shared for topic in chosen.values()):
+        of_robots = {name for name, topic in READABLE.items() if not topic.shared}
+        topics = (one.topic for one in reader.connections)
+        there = {namespace_of(one) for one in topics if base_name(one) in of_robots}
+        raise BagError(
+            f'{reader.path} has no topics of a run in the namespace {namespace}; it has them in '
+            f'{", ".join(sorted(there)) or "none"}'
+        )
+    return chosen
+
+
+def _wheel_names(parameters: dict[str, dict[str, Any]]) -> tuple[str, str]:
+    for values in parameters.values():
+        left, right = values.get('left_wheel_name'), values.get('right_wheel_name')
+        if isinstance(left, str) and isinstance(right, str):
+            return left, right
+    return WHEELS

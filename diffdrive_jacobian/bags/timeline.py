@@ -1,4 +1,4 @@
-"""A run as numbers over time.
+"""A run as numbers over time, and as the lines that are drawn.
 
 Times are seconds since the first odometry, by its own stamps.
 """
@@ -14,12 +14,12 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.run import Run, Series
+from diffdrive_jacobian.bags.run import Run, Series, number
 from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_WAYPOINTS
-from diffdrive_jacobian.messages.goal_follower import Fate, FollowedGoal, GoalFollower, Stamp
-from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.messages.goal_status import Fate, FollowedGoal, GoalFollower, GoalState, Stamp
+from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -171,26 +171,23 @@ def _breaks(run: Run) -> Indices:
 
 def _over_time(run: Run, value: Callable[[Run], float]) -> Array:
     """Return what a function of the parameters is at each odometry, shape (n,)."""
-    changes = [(since, value(now)) for since, now in run.configurations()]
-    since, values = np.array([one for one, _ in changes]), np.array([one for _, one in changes])
+    since, configurations = zip(*run.configurations(), strict=True)
+    values = np.array([value(now) for now in configurations], dtype=np.float64)
     latest = np.searchsorted(since, run.odometry.received, side='right') - 1
-    return np.asarray(values[np.maximum(latest, 0)], dtype=np.float64)
+    return np.asarray(values[np.maximum(latest, 0)])
 
 
 def _progress(
     run: Run, breaks: Indices, routes: list[Followed]
 ) -> tuple[Indices, NDArray[np.bool_], Indices]:
-    """Return for each odometry which goal is driven to, -1 for none, and whether it is reached.
-
-    And which route is the path that is driven along, -1 for none.
-    """
+    """Return for each odometry the goal driven to, whether it is reached, and the path driven along."""
     seen = run.odometry.received
     places = np.column_stack([_driven_points(run), _over_time(run, tolerance)])
     goal, reached = np.full(len(seen), -1), np.zeros(len(seen), dtype=bool)
     driven = np.full(len(seen), -1)
     known = len(run.goal_status) > 0 or bool(run.of_node('go_to_goal'))
     begins = [sent.received for sent, _ in routes]
-    for number, ((sent, followed), begun, until) in enumerate(
+    for which, ((sent, followed), begun, until) in enumerate(
         zip(routes, begins, [*begins, _NEVER][1:], strict=True)
     ):
         route, state = sent.rows, followed.state
@@ -204,7 +201,7 @@ def _progress(
         if sent.is_path:
             if succeeded:
                 stop = min(stop, int(np.searchsorted(seen, followed.since, side='right')))
-            driven[here:stop] = number
+            driven[here:stop] = which
             continue
         for target in route[:-1]:
             next_here = _first_within(run, places, target, here, stop)
@@ -244,7 +241,7 @@ def _along_paths(
     approach = run.number_of_node(
         'go_to_goal', 'path_approach_distance', GoToGoalParameters().path_approach_distance
     )
-    for number, (sent, _) in enumerate(routes):
+    for which_route, (sent, _) in enumerate(routes):
         if not sent.is_path:
             continue
         rows = run.planned_path.values[sent.rows.start : sent.rows.stop]
@@ -253,7 +250,7 @@ def _along_paths(
         except ValueError:
             # The node refuses it, too.
             continue
-        here = np.flatnonzero(driven == number)
+        here = np.flatnonzero(driven == which_route)
         which[here] = len(paths)
         paths.append(path)
         s = path.project(poses[here])
@@ -283,13 +280,7 @@ def _distances(run: Run, places: Array, target: int) -> Array:
 
 
 def _within(run: Run, places: Array, target: int) -> Mask:
-    """Return for each place whether it counts as arrived at a goal, shape (n,).
-
-    Args:
-        run: The run.
-        places: `[x, y, tolerance]` of each, shape (n, 3) (m).
-        target: The goal.
-    """
+    """Return which places `[x, y, tolerance]` (m) count as arrived at a goal, shape (n,)."""
     return np.asarray(_distances(run, places, target) <= places[:, 2] + 1e-12)
 
 
@@ -345,25 +336,16 @@ def _routes(run: Run) -> list[Followed]:
     A message that was not recorded was sent when its goal was accepted, and has no rows.
     """
     statuses = run.goal_status
-    routes = sorted(
-        [
-            *_sent(run, run.goals, MAX_WAYPOINTS, is_path=False),
-            *_sent(run, run.planned_path, MAX_PATH_POSES, is_path=True),
-        ],
-        key=attrgetter('received'),
-    )
-    received = [route.received for route in routes]
-    reports = [
-        *zip(
-            statuses.values[:, 0].astype(int).tolist(),
-            _stamps(run, statuses),
-            statuses.received.tolist(),
-            strict=True,
-        )
+    routes = [
+        *_sent(run, run.goals, MAX_WAYPOINTS, is_path=False),
+        *_sent(run, run.planned_path, MAX_PATH_POSES, is_path=True),
     ]
+    routes.sort(key=attrgetter('received'))
+    values = statuses.values[:, 0].astype(int).tolist()
+    reports = [*zip(values, _stamps(run, statuses), statuses.received.tolist(), strict=True)]
     follower: GoalFollower[Sent] = GoalFollower()
-    answered: list[int] = np.searchsorted(statuses.received, received).tolist()
-    answered.append(len(reports))
+    received = [route.received for route in routes]
+    answered = [*np.searchsorted(statuses.received, received).tolist(), len(reports)]
     for report in reports[: answered[0]]:
         follower.reported(*report)
     followed = []
@@ -391,18 +373,17 @@ def _stamps(run: Run, series: Series) -> list[Stamp]:
 
 
 def _driven_points(run: Run) -> Array:
-    """Return the point that the controller drives to the goal, shape (n, 2).
-
-    It is the axle centre if the controller is not built in. Its package may not be installed here, and
-    reading a bag must not import it.
-    """
+    """Return the point that the controller drives to the goal, shape (n, 2)."""
     x, y, theta = run.odometry.values[:, :3].T
     d = _over_time(run, _driven_offset)
     return np.column_stack([x + d * np.cos(theta), y + d * np.sin(theta)])
 
 
 def _driven_offset(run: Run) -> float:
-    """Return how far the driven point is ahead of the axle centre (m)."""
+    """Return how far the driven point is ahead of the axle centre (m), 0 of a law of other packages.
+
+    Reading a bag must not import these.
+    """
     name = run.of_node('go_to_goal').get('controller')
     controller = BUILT_IN.get(name) if isinstance(name, str) else None
     if controller is None or not controller.offset:
@@ -422,3 +403,117 @@ def tolerance(run: Run) -> float:
     """Return the distance from a goal that counts as arrived at the beginning (m)."""
     default = GoToGoalParameters().xy_goal_tolerance
     return run.number_of_node('go_to_goal', 'xy_goal_tolerance', default)
+
+
+# --- Lines
+
+BUCKETS = 1500
+"""A longer line is reduced to the minimum and the maximum of so many parts."""
+_TWIST = {'v': 0, 'omega': 1}
+_WHEEL = {'right': 0, 'left': 1}
+_READINGS = {column: topic for topic in SENSORS for column in topic.columns}
+"""Quantities of sensors, and their topics."""
+_BODY = ('virtual_robot', 'go_to_goal')
+_LIMITS = {
+    'v': (_BODY, 'linear.x.max_velocity', 'linear.x.min_velocity'),
+    'omega': (_BODY, 'angular.z.max_velocity', 'angular.z.min_velocity'),
+    'right': (('virtual_robot', 'wheel_bridge'), 'max_wheel_velocity', ''),
+}
+"""Quantity to the nodes that limit it, and their parameters of the upper and the lower limit."""
+
+
+def measured(one: Timeline, quantity: str) -> Array:
+    """Return the measured values of a quantity, shape (m, 2); m may be 0."""
+    run = one.run
+    if quantity in _READINGS:
+        topic = _READINGS[quantity]
+        series = getattr(run, topic.series)
+        values = series.values[:, topic.columns.index(quantity)]
+        return _continued(one, np.column_stack([seconds(run, series), values]))
+    if quantity in _WHEEL:
+        values = np.column_stack([seconds(run, run.wheels), run.wheels.values[:, _WHEEL[quantity]]])
+        return line(values, _back_in_time(values))
+    if quantity in _TWIST:
+        values = run.odometry.values[:, 3 + _TWIST[quantity]]
+        return line(np.column_stack([one.time, values]), one.breaks)
+    error: Array = getattr(one, quantity)
+    jumps = np.abs(np.diff(error)) > (np.inf if quantity == 'distance' else np.pi)
+    breaks = np.union1d(one.breaks, np.flatnonzero(jumps | (np.diff(one.goal) != 0)) + 1)
+    return line(np.column_stack([one.time, error]), breaks)
+
+
+def commanded(one: Timeline, quantity: str) -> Array:
+    """Return the commanded values of a quantity, each valid until the next, shape (m, 2); m may be 0."""
+    run = one.run
+    if quantity in _WHEEL:
+        series, column = run.wheel_commands, _WHEEL[quantity]
+    elif quantity in _TWIST:
+        series, column = run.cmd_vel if len(run.cmd_vel) else run.cmd_vel_out, _TWIST[quantity]
+    else:
+        return np.empty((0, 2))
+    return _continued(one, np.column_stack([seconds(run, series), series.values[:, column]]))
+
+
+def limits(one: Timeline) -> dict[str, Array]:
+    """Return the tightest limits of all nodes, by quantity: the lower and the upper one, each a line
+    (s, and m/s or rad/s), shape (2, m, 2). NaN: no limit.
+    """
+    rows: dict[str, list[list[list[float]]]] = {name: [] for name in _LIMITS}
+    for since, run in one.run.configurations():
+        now = np.array([since])
+        at = seconds(run, Series(received=now, stamps=now, values=np.empty((1, 0))))
+        time = max(0.0, float(at[0])) if since else 0.0
+        for name, (nodes, upper, lower) in _LIMITS.items():
+            values = [run.of_node(node) for node in nodes]
+            most = [number(one.get(upper)) for one in values]
+            least = [number(one.get(lower)) for one in values]
+            least = [-high if np.isnan(low) else low for low, high in zip(least, most, strict=True)]
+            bounds = _tightest(max, least), _tightest(min, most)
+            rows[name].append([[time, bound] for bound in bounds])
+    found = {
+        name: np.array([_continued(one, bound) for bound in np.swapaxes(np.array(values), 0, 1)])
+        for name, values in rows.items()
+    }
+    return {**found, 'left': found['right']}
+
+
+def _tightest(choose: Callable[[list[float]], float], bounds: list[float]) -> float:
+    return choose([bound for bound in bounds if not np.isnan(bound)] or [np.nan])
+
+
+def _continued(one: Timeline, rows: Array) -> Array:
+    """Return a line whose last value is continued to the end of the run, broken where time goes back."""
+    if len(rows):
+        rows = np.vstack([rows, [max(one.time[-1], rows[-1, 0]), rows[-1, 1]]])
+    return line(rows, _back_in_time(rows))
+
+
+def _back_in_time(rows: Array) -> Indices:
+    """Return before which rows time goes back."""
+    return np.flatnonzero(np.diff(rows[:, 0]) < 0.0) + 1
+
+
+def line(rows: Array, breaks: Indices) -> Array:
+    """Return a line that is broken before some of its rows and reduced if it is long.
+
+    Of each part of a long line, the rows with the minimum and the maximum of each column remain.
+    """
+    rows = np.where(np.isfinite(rows), rows, np.nan)
+    rows = np.insert(rows, breaks, np.nan, axis=0)
+    count, width = rows.shape
+    if count <= 2 * width * BUCKETS:
+        return rows
+    holes: Mask = np.any(np.isnan(rows), axis=1)
+    gaps = np.flatnonzero(holes[1:] & ~holes[:-1]) + 1
+    # With more gaps only dots would remain.
+    keep = [np.array([0, count - 1]), gaps[: len(gaps) * (len(gaps) <= BUCKETS // 10)]]
+    size = -(-count // BUCKETS)
+    starts = np.arange(0, count, size)
+    for column in rows.T:
+        for sign in (1.0, -1.0):
+            # Rows with NaN count as the greatest.
+            padded = np.full(len(starts) * size, np.inf)
+            padded[:count] = np.where(np.isnan(column), np.inf, sign * column)
+            keep.append(starts + padded.reshape(-1, size).argmin(axis=1))
+    kept: Array = rows[np.unique(np.concatenate(keep))]
+    return kept if len(gaps) <= BUCKETS // 10 else kept[~np.isnan(kept).any(axis=1)]

@@ -15,15 +15,15 @@ import math
 import re
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.bags.run import Run, Series
-from diffdrive_jacobian.bags.run_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
 from diffdrive_jacobian.numerics.elementary import wrap
@@ -32,70 +32,7 @@ from diffdrive_jacobian.parameters.virtual_robot import MULTIPLIERS, VirtualRobo
 from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
-from diffdrive_jacobian.simulation.slip import Drift
 from diffdrive_jacobian.time_units import NANOSECONDS
-
-NODE = 'virtual_robot'
-
-
-class TruthDifferences(NamedTuple):
-    """Differences of ground truth and simulated robot at each of n messages of ground_truth."""
-
-    distances: NDArray[np.float64]
-    """Differences of the position, shape (n,) (m)."""
-    headings: NDArray[np.float64]
-    """Differences of the heading, not negative, shape (n,) (rad)."""
-
-
-def recorded_drift(run: Run) -> Drift | None:
-    """Return in what the true motion of the recorded robot differs from its odometry.
-
-    None: in nothing, or its parameters were not recorded.
-    """
-    try:
-        return from_ros(VirtualRobotParameters, run.of_node(NODE)).drift()
-    except ParameterError:
-        return None
-
-
-def truth_differences(run: Run, robots: Iterable[Robot]) -> TruthDifferences | None:
-    """Compare the ground truth of a run with simulated robots at the same stamps.
-
-    Args:
-        run: The run.
-        robots: Simulated robots. Messages whose stamp none of them has are left out.
-
-    Returns:
-        The differences. None: there is nothing to compare, or the robots have no drift.
-    """
-    at = {robot.stamp: robot for robot in robots if robot.model.drift is not None}
-    truth = run.ground_truth
-    rows = [index for index, stamp in enumerate(truth.stamps.tolist()) if stamp in at]
-    if not rows:
-        return None
-    simulated = np.array([at[stamp].true_pose_tuple for stamp in truth.stamps[rows].tolist()])
-    difference: NDArray[np.float64] = truth.values[rows, :3] - simulated
-    return TruthDifferences(np.hypot(difference[:, 0], difference[:, 1]), np.abs(wrap(difference[:, 2])))
-
-
-def placed_as_recorded(run: Run, placed: tuple[Robot, Robot]) -> Robot:
-    """Return which of two placements of a robot the ground truth after it fits.
-
-    Args:
-        run: The run.
-        placed: The robot whose true pose was placed, and the one whose odometry alone was reset.
-    """
-    truth = run.ground_truth
-    later = np.flatnonzero(truth.stamps > placed[0].stamp)
-    if placed[0].model.drift is None or not len(later):
-        return placed[0]
-    stamp, place = int(truth.stamps[later[0]]), truth.values[later[0], :2]
-
-    def apart(robot: Robot) -> float:
-        return float(np.hypot(*(robot.at(stamp).true_pose[:2] - place)))
-
-    return min(placed, key=apart)
-
 
 ROBOT = 'virtual_robot'
 EXACT, BY_RECORDING_TIME = 1e-9, 0.02
@@ -127,6 +64,44 @@ _FAULTY_ROBOT = re.compile(r"robot='([^']*)'")
 _NEVER = int(np.iinfo(np.int64).max)
 
 
+class TruthDifferences(NamedTuple):
+    """Differences of ground truth and simulated robot at each of n messages of ground_truth."""
+
+    distances: NDArray[np.float64]
+    """Differences of the position, shape (n,) (m)."""
+    headings: NDArray[np.float64]
+    """Differences of the heading, not negative, shape (n,) (rad)."""
+
+
+def truth_differences(run: Run, robots: Iterable[Robot]) -> TruthDifferences | None:
+    """Compare the ground truth of a run with simulated robots at the same stamps.
+
+    None: no message has the stamp of a robot, or the robots have no drift.
+    """
+    at = {robot.stamp: robot for robot in robots if robot.model.drift is not None}
+    truth = run.ground_truth
+    rows = [index for index, stamp in enumerate(truth.stamps.tolist()) if stamp in at]
+    if not rows:
+        return None
+    simulated = np.array([at[stamp].true_pose_tuple for stamp in truth.stamps[rows].tolist()])
+    difference: NDArray[np.float64] = truth.values[rows, :3] - simulated
+    return TruthDifferences(np.hypot(difference[:, 0], difference[:, 1]), np.abs(wrap(difference[:, 2])))
+
+
+def placed_as_recorded(run: Run, placed: tuple[Robot, Robot]) -> Robot:
+    """Return which robot the ground truth fits: the one that was placed, or with its odometry reset."""
+    truth = run.ground_truth
+    later = np.flatnonzero(truth.stamps > placed[0].stamp)
+    if placed[0].model.drift is None or not len(later):
+        return placed[0]
+    stamp, place = int(truth.stamps[later[0]]), truth.values[later[0], :2]
+
+    def apart(robot: Robot) -> float:
+        return float(np.hypot(*(robot.at(stamp).true_pose[:2] - place)))
+
+    return min(placed, key=apart)
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Verification:
     """Differences of odometry and simulated robot at each of n odometry messages."""
@@ -146,11 +121,10 @@ class Verification:
     many odometry messages were not compared."""
     covariance_difference: float | None = None
     """Largest difference of a covariance of the pose from the exact moments of the noise model, relative
-    to the standard deviations. None: they were not compared, because the parameters of the robot or its
-    start were not recorded."""
+    to the standard deviations. None: the parameters of the robot or its start were not recorded."""
     truth: TruthDifferences | None = None
-    """Differences of the ground truth. None: it was not compared, because it, the parameters of the
-    robot or its start were not recorded."""
+    """Differences of the ground truth. None: it, the parameters of the robot or its start were not
+    recorded."""
 
     @property
     def allowed(self) -> float:
@@ -211,12 +185,8 @@ def verify(
     else:
         source, start, anchors = _commanded(run, parameters)
     stamps, values = run.odometry.stamps, run.odometry.values
-    seconds, poses = [], []
-    simulated: list[Robot] = []
-    compared: list[int] = []
-    measured = []
-    followed = False
-    epochs = _epochs(run.odometry)
+    # How often time went back before each message.
+    epochs: list[int] = [0, *np.cumsum(np.diff(stamps) < 0).tolist()]
     if epochs[-1] >= len(anchors):
         raise BagError(
             f'{run.path} cannot be followed: time goes back {epochs[-1]} times in the odometry, but the '
@@ -226,86 +196,74 @@ def verify(
     first_commands = [
         next((anchor.robot.stamp for anchor in epoch if anchor.is_command), _NEVER) for epoch in anchors
     ]
+    simulated: dict[int, Robot] = {}
+    followed = False
     for index, epoch in enumerate(epochs):
         if interrupted():
             raise ReadingInterruptedError
         found = _nearest(anchors[epoch], run.odometry, index)
         if found is not None:
-            if epoch == 0:
-                simulated.append(found)
-                compared.append(index)
+            simulated[index] = found
             followed |= int(stamps[index]) > first_commands[epoch]
-            seconds.append((stamps[index] - stamps[0]) / NANOSECONDS)
-            poses.append(found.pose)
-            measured.append(values[index, :3])
     if not followed:
         raise BagError(
             f'{run.path} has no odometry after the first command on {source}, so that no motion can be '
             'verified (are their stamps of different clocks?)'
         )
-    notes = run.notes + (_missing(run, start) if source == 'cmd_vel_out' else ())
-    if source == 'cmd_vel_out' and _known_since(run):
-        notes += (
-            'the robot moved before the first command that was recorded: what it was commanded before '
-            'is missing',
-        )
-    if len(poses) < len(stamps):
-        omitted = len(stamps) - len(poses)
-        notes += (
-            f'{omitted} of {len(stamps)} odometry messages precede the start of the simulated robot and '
-            'were not compared',
-        )
-    covariance_difference = None
-    if start == 'start_pose' and recorded_model(run) and len(run.odometry_covariances) == len(stamps):
-        covariance_difference = largest_covariance_difference(
-            simulated, run.odometry_covariances[compared, :6]
-        )
-    truth = None
-    if start == 'start_pose':
-        truth = truth_differences(run, simulated)
-    if truth is None and len(run.ground_truth):
-        notes += (
-            'ground_truth was not compared: it needs the parameters of virtual_robot, cmd_vel_out and '
-            'the first start_pose',
-        )
-    difference: NDArray[np.float64] = np.array(measured) - np.array(poses)
+    compared = list(simulated)
+    poses = np.array([robot.pose for robot in simulated.values()])
+    difference: NDArray[np.float64] = values[compared, :3] - poses
     distances = np.hypot(difference[:, 0], difference[:, 1])
-    if source == 'cmd_vel_out' and not run.of_node(ROBOT) and np.any(distances > EXACT):
-        notes += (
-            'the parameters of virtual_robot were not recorded: the motion of a robot with limits of '
-            'the acceleration, a lag or a delay cannot be reproduced without them',
+    covariance_difference = truth = None
+    if start == 'start_pose':
+        # Later placements may have other covariances and truths.
+        first = {index: robot for index, robot in simulated.items() if not epochs[index]}
+        truth = truth_differences(run, first.values())
+        if recorded_model(run) and len(run.odometry_covariances) == len(stamps):
+            recorded = run.odometry_covariances[list(first), :6]
+            covariance_difference = largest_covariance_difference(first.values(), recorded)
+    notes = list(run.notes)
+    if source == 'cmd_vel_out' and start == 'odometry' and recorded_dynamics(run):
+        notes.append(
+            'the robot follows commands with acceleration limits, a lag or a delay, and its start is '
+            'not recorded: what it was commanded before is missing'
         )
-    elif source == 'cmd_vel_out' and not run.fault_events and np.any(distances > EXACT):
-        notes += (
+    if source == 'cmd_vel_out' and _known_since(run):
+        notes.append(
+            'the robot moved before the first command that was recorded: what it was commanded before '
+            'is missing'
+        )
+    if omitted := len(stamps) - len(simulated):
+        notes.append(
+            f'{omitted} of {len(stamps)} odometry messages precede the start of the simulated robot and '
+            'were not compared'
+        )
+    if truth is None and len(run.ground_truth):
+        notes.append(
+            'ground_truth was not compared: it needs the parameters of virtual_robot, cmd_vel_out and '
+            'the first start_pose'
+        )
+    differs = source == 'cmd_vel_out' and bool(np.any(distances > EXACT))
+    if differs and not run.of_node(ROBOT):
+        notes.append(
+            'the parameters of virtual_robot were not recorded: the motion of a robot with limits of '
+            'the acceleration, a lag or a delay cannot be reproduced without them'
+        )
+    elif differs and not run.fault_events:
+        notes.append(
             'no faults are recorded: if this was a lockstep world with a fault of the motors, record '
-            '/fault_events',
+            '/fault_events'
         )
     return Verification(
         source=source,
         start=start,
-        seconds=np.array(seconds),
+        seconds=(stamps[compared] - stamps[0]) / NANOSECONDS,
         distances=distances,
         headings=np.abs(wrap(difference[:, 2])),
-        notes=notes,
+        notes=tuple(notes),
         covariance_difference=covariance_difference,
         truth=truth,
     )
-
-
-def _missing(run: Run, start: str) -> tuple[str, ...]:
-    """Return what is missing to reproduce the motion of a robot that follows commands with a delay."""
-    if start == 'odometry' and recorded_dynamics(run):
-        return (
-            'the robot follows commands with acceleration limits, a lag or a delay, and its start is '
-            'not recorded: what it was commanded before is missing',
-        )
-    return ()
-
-
-def _epochs(series: Series) -> list[int]:
-    """Return for each message how often time went back before it."""
-    back = np.diff(series.stamps) < 0
-    return [0, *np.cumsum(back).astype(int).tolist()]
 
 
 def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> Robot | None:
@@ -407,16 +365,16 @@ def _known_since(run: Run) -> int:
 
 def _beginning(run: Run, index: int) -> Robot:
     """Return the robot with the pose and the twist of an odometry message."""
-    x, y, theta, v, omega = run.odometry.values[index].tolist()
-    stamp = int(run.odometry.stamps[index])
-    robot = Robot(model=RobotModel(), stamp=stamp, pose=np.array([x, y, theta]))
-    return robot.commanded((v, omega), stamp)
+    stamp, values = int(run.odometry.stamps[index]), run.odometry.values[index]
+    robot = Robot(model=RobotModel(), stamp=stamp, pose=values[:3].copy())
+    return robot.commanded((float(values[3]), float(values[4])), stamp)
 
 
 def _starts_before_recording(run: Run) -> int:
     """Return how many messages of `start_pose` are latched, from before the recording."""
-    starts = run.start_pose
-    begun = int(run.odometry.stamps[0]) - _period(run)
+    starts, gaps = run.start_pose, np.diff(run.odometry.stamps)
+    # Half a period allows for a late timer.
+    begun = int(run.odometry.stamps[0]) - (int(np.median(gaps) * 1.5) if len(gaps) else 0)
     count = 0
     for stamp, received in zip(starts.stamps.tolist(), starts.received.tolist(), strict=True):
         late = received - int(starts.received[0])
@@ -446,12 +404,6 @@ def _stood_since(run: Run, index: int) -> bool:
     )
 
 
-def _period(run: Run) -> int:
-    """Return 1.5 periods of the odometry, which allows for a late timer (ns)."""
-    gaps = np.diff(run.odometry.stamps)
-    return int(np.median(gaps) * 1.5) if len(gaps) else 0
-
-
 def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, list[list[_Anchor]]]:
     """Return the robot after each `cmd_vel`, or `joint_command` if it is driven by its wheels."""
     values = dict(given if given is not None else run.of_node(ROBOT))
@@ -476,11 +428,10 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
     ]
     events.sort(key=lambda event: event[0])
     before = max(int(np.searchsorted(run.odometry.stamps, int(series.received[0]))) - 1, 0)
-    x, y, theta = run.odometry.values[before, :3]
     robot = Robot(
         model=parameters.model(),
         stamp=int(run.odometry.stamps[before]),
-        pose=np.array([x, y, theta]),
+        pose=run.odometry.values[before, :3].copy(),
     )
     anchors = [_Anchor(robot, int(run.odometry.received[before]))]
     for received, event in events:
@@ -494,20 +445,15 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
             )
         else:
             try:
-                twist = _twist(robot.model, source, event)
+                first, second = event.tolist()
+                wheels = source == 'joint_command'
+                twist = plausible_twist(*robot.model.twist(first, second)) if wheels else (first, second)
             except MessageError:
                 # The node drops it as well.
                 continue
             robot = robot.commanded(twist, received)
         anchors.append(_Anchor(robot, received, is_command=not isinstance(event, dict)))
     return source, 'odometry', [anchors]
-
-
-def _twist(model: RobotModel, source: str, values: NDArray[np.float64]) -> tuple[float, float]:
-    first, second = (float(value) for value in values)
-    if source == 'cmd_vel':
-        return first, second
-    return plausible_twist(*model.twist(first, second))
 
 
 # --- The covariances
@@ -528,7 +474,10 @@ def recorded_model(run: Run) -> RobotModel | None:
     separation *= run.number_of_node(ROBOT, 'wheel_separation_multiplier', 1.0)
     if changed & {*_NOISE_PARAMETERS, *MULTIPLIERS} or not (separation > 0.0 and variance >= 0.0):
         return None
-    drift = recorded_drift(run)
+    try:
+        drift = from_ros(VirtualRobotParameters, recorded).drift()
+    except ParameterError:
+        drift = None
     return RobotModel(wheel_separation=separation, wheel_travel_variance=variance, drift=drift)
 
 
@@ -606,15 +555,11 @@ def start_covariances(run: Run) -> NDArray[np.float64]:
     return matrices
 
 
-def largest_covariance_difference(robots: Sequence[Robot], recorded: NDArray[np.float64]) -> float:
+def largest_covariance_difference(robots: Iterable[Robot], recorded: NDArray[np.float64]) -> float:
     """Return the largest difference of recorded covariances from the exact moments of the noise model.
 
-    Args:
-        robots: The robot at each message.
-        recorded: Entries xx, xy, xt, yy, yt, tt of each message, shape (n, 6).
-
-    Returns:
-        The difference, relative to the standard deviations. Infinity: a covariance is not comparable.
+    It is relative to the standard deviations; infinity: a covariance is not comparable. `recorded` has
+    the entries xx, xy, xt, yy, yt, tt at each robot, shape (n, 6).
     """
     computed = np.array([robot.moments[:6] for robot in robots]).reshape(-1, 6)
     position = np.sqrt(computed[:, 0] + computed[:, 3])

@@ -8,8 +8,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from diffdrive_jacobian.messages.names import base_name
-from diffdrive_jacobian.messages.topic_faults import ALTERNATING, SEVERAL, UNPUBLISHED, UNREAD
-from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TOPICS, Topic
+from diffdrive_jacobian.messages.topics import (
+    ALTERNATING,
+    CLOCK,
+    OF_EVERY_NODE,
+    SEVERAL,
+    TOPICS,
+    UNPUBLISHED,
+    UNREAD,
+    Topic,
+)
 from diffdrive_jacobian.text import listed
 
 INFINITE = 2**63 - 1

@@ -21,14 +21,16 @@ from diffdrive_jacobian.exploration.scenario import ScenarioName
 from diffdrive_jacobian.faults import Fault
 from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.messages.fields import is_identifier, plain, walk
 from diffdrive_jacobian.messages.structure import (
     Array,
     FieldType,
     Number,
     Sequence,
     Structure,
+    is_identifier,
+    plain,
     structure,
+    walk,
 )
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.properties import Property, Watch

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.bag_reader import BagError, open_bag
-from diffdrive_jacobian.bags.run import Run, Series
-from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.run import Run, Series, read_run
 from diffdrive_jacobian.bags.timeline import jumps, seconds, timeline
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.live import settings
@@ -24,8 +23,7 @@ from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.robot_state import MAX_POINTS, TRUTH_LIFE, RobotState, Trail
 from diffdrive_jacobian.live.server import LiveServer, Ready
 from diffdrive_jacobian.live.session import Session, Snapshot
-from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.covariances import from_covariance
+from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.names import base_name, namespace_of
 from diffdrive_jacobian.messages.topics import SENSORS, TOPICS

@@ -35,8 +35,7 @@ from diffdrive_jacobian.live.robot_state import GoalEnd, RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
 from diffdrive_jacobian.live.session import Session
 from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, PATH, POSE, Motion, Route, Status
-from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
-from diffdrive_jacobian.messages.covariances import from_covariance
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError, from_covariance
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.nodes.remote_goal import ignores_heading

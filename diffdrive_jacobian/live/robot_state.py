@@ -19,14 +19,14 @@ from diffdrive_jacobian.control.path import PathProgress
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.live import quantities
 from diffdrive_jacobian.live.quantities import rounded
-from diffdrive_jacobian.messages.goal_follower import (
+from diffdrive_jacobian.messages.goal_status import (
     UNSTAMPED,
     Fate,
     FollowedGoal,
     GoalFollower,
+    GoalState,
     Stamp,
 )
-from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters

@@ -9,8 +9,17 @@ from typing import TYPE_CHECKING, Any
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.messages.fields import is_stamp, plain, walk
-from diffdrive_jacobian.messages.structure import Array, FieldType, Sequence, Structure, Text, structure
+from diffdrive_jacobian.messages.structure import (
+    Array,
+    FieldType,
+    Sequence,
+    Structure,
+    Text,
+    is_stamp,
+    plain,
+    structure,
+    walk,
+)
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS

@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.fields import check_readable, field_value
 from diffdrive_jacobian.messages.structure import (
     BIG_ENDIAN,
     COUNT,
@@ -37,6 +36,8 @@ from diffdrive_jacobian.messages.structure import (
     Structure,
     Text,
     check_plain,
+    check_readable,
+    field_value,
     least_size,
     structure,
     uniform_size,
@@ -47,12 +48,7 @@ SMALLEST = sys.float_info.min
 
 
 def integer_warning(what: str, *values: float) -> str | None:
-    """Return a warning if a value is an integer that was assigned to a field of floats, else None.
-
-    Args:
-        what: What has the values.
-        values: The values of the fields.
-    """
+    """Return a warning if a value is an integer that was assigned to a field of floats, else None."""
     for value in values:
         if value and -SMALLEST < value < SMALLEST:
             return (
@@ -113,9 +109,8 @@ class Reader:
                 sequence, `goals[].pose.position.x` a tuple with that field of each of its elements.
             whole: Whether what follows the last field must be valid too.
             bounded: Whether to refuse messages with more than 200,000 values and strings to read.
-            deserialize: Reads the encapsulations that this class does not, such as parameter lists, and
-                sequences of many strings (`rclpy.serialization.deserialize_message`). None: these
-                encapsulations are invalid. It needs the class.
+            deserialize: `rclpy.serialization.deserialize_message`, for other encapsulations, which are
+                invalid otherwise, and for sequences of many strings. It needs the class.
 
         Raises:
             ValueError: A field does not exist, or cannot be read on its own.
@@ -228,13 +223,19 @@ class _Walk:
     def _picker(self) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
         picks = [self._picks[field] for field in self._fields]
         of_each = any(isinstance(one, list) for one in picks)
+
+        def pick_each(values: tuple[Any, ...]) -> tuple[Any, ...]:
+            return tuple(
+                tuple(values[index] for index in one) if isinstance(one, list) else values[one]
+                for one in picks
+            )
+
         # An itemgetter of one index returns no tuple.
-        pick: Any = _picked(picks) if of_each or len(picks) < 2 else itemgetter(*picks)
+        pick: Callable[[tuple[Any, ...]], tuple[Any, ...]]
+        pick = pick_each if of_each or len(picks) < 2 else itemgetter(*picks)
         texts = [number for number, field in enumerate(self._fields) if field in self._texts]
         if not texts:
-            picker: Callable[[tuple[Any, ...]], tuple[Any, ...]] = pick
-            return picker
-
+            return pick
         # A short message has few texts, and usually the same ones as before.
         convert = _converted_before if self._offset <= _MAX_REMEMBERED else _converted
         if texts == [0] and len(picks) > 2 and not of_each:
@@ -368,28 +369,14 @@ class _Walk:
             self._formatted = offset
 
 
-def _picked(picks: Values[Any]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
-    """Return a function of values that returns those at some indices, and a tuple for a list of them."""
-
-    def pick(values: tuple[Any, ...]) -> tuple[Any, ...]:
-        return tuple(
-            tuple(values[index] for index in one) if isinstance(one, list) else values[one]
-            for one in picks
-        )
-
-    return pick
-
-
 def _converted(raw: Any) -> Any:
     """Return a string, or strings as deep in tuples as they are."""
-    return _text(raw) if isinstance(raw, bytes) else tuple(map(_converted, raw))
+    if isinstance(raw, bytes):
+        return raw.partition(b'\0')[0].decode('utf-8', 'replace')
+    return tuple(map(_converted, raw))
 
 
 _converted_before = lru_cache(maxsize=64)(_converted)
-
-
-def _text(raw: bytes) -> str:
-    return raw.partition(b'\0')[0].decode('utf-8', 'replace')
 
 
 class Writer:
@@ -432,8 +419,11 @@ class Writer:
         self._tail = (tail,) if any(tail) else ()
         self._pack = struct.Struct(layout).pack
         self._head = constants[:1]
-        self._first = slice(runs[0].numbers if len(runs) > 1 else None)
-        self._more = list(zip(constants, _parts(runs), strict=True))[1:]
+        ends = list(accumulate(run.numbers for run in runs))
+        # Values after the last run are left to it, which refuses them.
+        parts = [slice(*pair) for pair in pairwise([0, *ends[:-1], None])]
+        self._first = parts[0]
+        self._more = list(zip(constants[1:], parts[1:], strict=True))
 
     def __call__(self, *values: Any) -> bytes:
         """Return the message with these numbers, one for each field or element of a field.
@@ -515,11 +505,7 @@ class _Run(NamedTuple):
 
 
 def _runs(encoder: _Encoder, fields: Values[str]) -> list[_Run]:
-    """Return the runs of the fields, as few as possible.
-
-    Raises:
-        ValueError: A field is no number, or is not in the order of the message.
-    """
+    """Return the runs of the fields, as few as possible."""
     paths = [path for field in fields for path in encoder.arrays.get(field, [field])]
     unknown = [path for path in paths if path not in encoder.numbers]
     if unknown:
@@ -536,10 +522,3 @@ def _runs(encoder: _Encoder, fields: Values[str]) -> list[_Run]:
             start, text, count = offset, '', 0
         runs.append(_Run(start, offset + kind.size, text + kind.code, count + 1))
     return runs
-
-
-def _parts(runs: list[_Run]) -> list[slice]:
-    """Return which of the values are those of each run. Those after the last one are left to it."""
-    ends = list(accumulate(run.numbers for run in runs))
-    starts = [0, *ends[:-1]][: len(runs)]
-    return [slice(*pair) for pair in zip(starts, [*ends[:-1], None], strict=False)]

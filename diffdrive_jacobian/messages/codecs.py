@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import itemgetter
@@ -71,14 +71,10 @@ class Codec(Generic[V]):
     def reader(
         self, kind: Any, deserialize: Callable[[bytes, Any], Any] | None = None
     ) -> Callable[[bytes], V]:
-        """Return a function that returns the value in a serialized message.
+        """Return a function that returns the value in a serialized message; arguments as `cdr.Reader`.
 
         It raises MessageError: DecodingError if the bytes are not a message of the type, and others if
         the value is invalid.
-
-        Args:
-            kind: Type of the messages: their class or its `Structure`.
-            deserialize: As for `cdr.Reader`.
         """
         read, value = Reader(kind, self.fields, deserialize=deserialize), self.value
         if self.header is None:
@@ -93,11 +89,7 @@ class Codec(Generic[V]):
         return checked
 
     def writer(self, template: Any) -> Callable[[V], bytes]:
-        """Return a function that serializes values.
-
-        Args:
-            template: A message object whose strings and lengths are those of all messages.
-        """
+        """Return a function that serializes values, with the strings and lengths of a template."""
         write, numbers = Writer(template, self.written), self.numbers
         return lambda value: write(*numbers(value))
 
@@ -279,11 +271,7 @@ class Route(NamedTuple):
 
     @property
     def time(self) -> int:
-        """The stamp as a time (ns).
-
-        Raises:
-            MessageError: It is none.
-        """
+        """The stamp as a time (ns), or a MessageError."""
         return from_time(*self.stamp)
 
     @property
@@ -315,11 +303,7 @@ class Status(NamedTuple):
 
     @property
     def time(self) -> int:
-        """The stamp as a time (ns).
-
-        Raises:
-            MessageError: It is none.
-        """
+        """The stamp as a time (ns), or a MessageError."""
         return from_time(*self.stamp)
 
 
@@ -330,6 +314,10 @@ def _at_most(most: int, what: str) -> Callable[[int, int, int], tuple[tuple[int,
         return (sec, nanosec), count
 
     return header
+
+
+def _poses(columns: Iterable[tuple[float, ...]]) -> tuple[tuple[float, float, float], ...]:
+    return tuple(from_pose(*pose) for pose in zip(*columns, strict=True))
 
 
 POSE = Codec(
@@ -344,12 +332,7 @@ GOALS_HEADER = Codec('nav_msgs/msg/Goals', (*STAMP, 'len(goals)'), _at_most(MAX_
 GOALS = Codec(
     'nav_msgs/msg/Goals',
     (*STAMP, FRAME, 'goals[].header.frame_id', *(f'goals[].pose.{field}' for field in _POSE)),
-    lambda sec, nanosec, frame, frames, *columns: Route(
-        (sec, nanosec),
-        frame,
-        tuple(from_pose(*pose) for pose in zip(*columns, strict=True)),
-        frames,
-    ),
+    lambda sec, nanosec, frame, frames, *columns: Route((sec, nanosec), frame, _poses(columns), frames),
     header=GOALS_HEADER,
 )
 PATH_HEADER = Codec('nav_msgs/msg/Path', (*STAMP, 'len(poses)'), _at_most(MAX_PATH_POSES, 'path'))
@@ -362,11 +345,7 @@ PATH = Codec(
         *(f'poses[].pose.{field}' for field in _POSE),
     ),
     lambda sec, nanosec, frame, frames, secs, nanosecs, *columns: Route(
-        (sec, nanosec),
-        frame,
-        tuple(from_pose(*pose) for pose in zip(*columns, strict=True)),
-        frames,
-        tuple(zip(secs, nanosecs, strict=True)),
+        (sec, nanosec), frame, _poses(columns), frames, tuple(zip(secs, nanosecs, strict=True))
     ),
     header=PATH_HEADER,
 )
@@ -399,14 +378,7 @@ class Wheels(NamedTuple):
         speeds: tuple[float, float],
         angles: tuple[float, float] | None = None,
     ) -> Wheels:
-        """Return the joints of two wheels.
-
-        Args:
-            stamp: Time (ns).
-            joints: Names of the left and the right wheel joint.
-            speeds: `(omega_R, omega_L)` (rad/s).
-            angles: Of the right and the left wheel (rad); None: unknown.
-        """
+        """Return both joints, from `(omega_R, omega_L)` (rad/s) and angles (rad) in that order."""
         return cls(stamp, joints, () if angles is None else angles[::-1], speeds[::-1])
 
     def speeds(self, names: tuple[str, str]) -> tuple[float, float]:
@@ -419,10 +391,9 @@ class Wheels(NamedTuple):
 
 
 class WheelArray(NamedTuple):
-    """Speeds of the left and the right wheel, without their names and a stamp."""
+    """Speeds of the left and the right wheel (rad/s), without their names and a stamp."""
 
     velocities: tuple[float, ...]
-    """(rad/s)"""
     stamp: int = 0
 
     @classmethod
@@ -481,12 +452,7 @@ _VALUES = (
 _PARAMETER = ('name', 'value.type', *(f'value.{field}' for field in _VALUES if field))
 
 
-def parameter_value(kind: int, *values: Any) -> Any:
-    """Return the value of a parameter from its type and the fields of `ParameterValue`.
-
-    Raises:
-        MessageError: The type is unknown.
-    """
+def _parameter_value(kind: int, *values: Any) -> Any:
     if not 0 <= kind < len(_VALUES):
         raise MessageError(f'the type of a parameter must be 0 to {len(_VALUES) - 1}, got {kind}')
     value = values[kind - 1] if kind else None
@@ -498,7 +464,7 @@ def _changes(sec: int, nanosec: int, node: str, *columns: tuple[Any, ...]) -> Ch
     parameters = (
         parameter for part in (columns[:count], columns[count:]) for parameter in zip(*part, strict=True)
     )
-    values = {name: parameter_value(*value) for name, *value in parameters}
+    values = {name: _parameter_value(*value) for name, *value in parameters}
     return Changes(node, values, from_time(sec, nanosec))
 
 

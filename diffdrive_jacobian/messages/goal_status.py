@@ -1,8 +1,14 @@
-"""States of a goal, as action_msgs/GoalStatus numbers them, for code that needs no message package."""
+"""States of a goal, and what became of the goals that were sent to a controller.
+
+A status names its goal by the stamp of the message that contained the goal. It may be received before
+the goal, as they are different topics, and several goals may have the same stamp, such as none.
+"""
 
 from __future__ import annotations
 
-from enum import IntEnum
+from dataclasses import dataclass
+from enum import Enum, IntEnum, auto
+from typing import Generic, TypeAlias, TypeVar
 
 
 class GoalState(IntEnum):
@@ -42,3 +48,151 @@ FOLLOWING = {
     **dict.fromkeys(ENDED, ()),
 }
 """What may follow each state. UNKNOWN: the goal has had no status. ABORTED may come first: refused."""
+
+
+G = TypeVar('G')
+Stamp: TypeAlias = tuple[int, int]
+"""sec and nanosec of a message, which may be anything."""
+UNSTAMPED: Stamp = (0, 0)
+MAX_KNOWN = 32
+"""Number of stamps whose goals are remembered."""
+
+
+class Fate(Enum):
+    """What became of a goal."""
+
+    WAITING = auto()
+    """It has no status yet."""
+    ACTIVE = auto()
+    """The controller drives to it."""
+    SUCCEEDED = auto()
+    """The robot has arrived."""
+    REPLACED = auto()
+    """The controller ended it, or drives to another one, because a later goal was sent."""
+    CANCELED = auto()
+    """The controller ended it on request."""
+    ABORTED = auto()
+    """The controller gave it up."""
+    REFUSED = auto()
+    """The controller never accepted it."""
+
+    @property
+    def is_end(self) -> bool:
+        """Whether the controller has finished with it, and not because of a later goal."""
+        return self not in (Fate.WAITING, Fate.ACTIVE, Fate.REPLACED)
+
+
+@dataclass(slots=True, eq=False)
+class FollowedGoal(Generic[G]):
+    """A goal and its last status."""
+
+    goal: G | None
+    """What was sent. None: only statuses of it were received."""
+    stamp: Stamp
+    state: GoalState = GoalState.UNKNOWN
+    since: float = 0.0
+    """Time of its last status."""
+    accepted: bool = False
+    """Whether the controller has driven to it."""
+    replaced: bool = False
+    """Whether the controller left it for another goal."""
+    earlier: FollowedGoal[G] | None = None
+    """The goal with the same stamp that was active when this one was sent."""
+
+    @property
+    def fate(self) -> Fate:
+        """What became of it."""
+        if self.replaced:
+            return Fate.REPLACED
+        if self.state.active:
+            return Fate.ACTIVE
+        if self.state is GoalState.ABORTED and not self.accepted:
+            return Fate.REFUSED
+        return _FATES[self.state]
+
+
+_FATES = {
+    GoalState.UNKNOWN: Fate.WAITING,
+    GoalState.SUCCEEDED: Fate.SUCCEEDED,
+    GoalState.CANCELED: Fate.CANCELED,
+    GoalState.ABORTED: Fate.ABORTED,
+}
+
+
+class GoalFollower(Generic[G]):
+    """Follows the goals of one controller, which drives to one of them at a time."""
+
+    def __init__(self) -> None:
+        """Start without goals."""
+        self.newest: FollowedGoal[G] | None = None
+        """The goal that was sent last."""
+        self.driving: FollowedGoal[G] | None = None
+        """The goal that the controller drives to. None: it drives to none."""
+        self._goals: dict[Stamp, FollowedGoal[G]] = {}
+
+    def sent(self, goal: G, stamp: Stamp) -> FollowedGoal[G]:
+        """Take a goal that was sent; return it with its status, which may have been received before."""
+        known = self._goals.get(stamp)
+        # An unstamped goal that has ended was another one.
+        if known is not None and known.goal is None and (known.state.active or stamp != UNSTAMPED):
+            known.goal, self.newest = goal, known
+            return known
+        self.newest = followed = FollowedGoal(goal, stamp)
+        if known is not None:
+            followed.earlier = known if known.state.active else known.earlier
+        self._remember(followed)
+        return followed
+
+    def reported(self, status: int, stamp: Stamp, time: float = 0.0) -> FollowedGoal[G] | None:
+        """Take a status that the controller has published.
+
+        Args:
+            status: Number of action_msgs/GoalStatus. UNKNOWN and invalid numbers are ignored.
+            stamp: Stamp of the goal.
+            time: When it was received, in any unit.
+
+        Returns:
+            The goal whose fate has changed. None: there is none.
+        """
+        if status == GoalState.UNKNOWN or status not in set(GoalState):
+            return None
+        state = GoalState(status)
+        followed = self._concerned(state, stamp)
+        before = followed.fate
+        followed.state, followed.since = state, time
+        if state.active:
+            if self.driving is not None:
+                self.driving.replaced = True
+            self.driving = followed
+            followed.accepted, followed.replaced, followed.earlier = True, False, None
+        else:
+            newest = self.newest
+            makes_room = newest is not None and newest is not followed and not newest.state.ended
+            followed.replaced = state is not GoalState.SUCCEEDED and followed.accepted and makes_room
+            if self.driving is followed:
+                self.driving = None
+        return None if followed.fate is before else followed
+
+    def _concerned(self, state: GoalState, stamp: Stamp) -> FollowedGoal[G]:
+        """Return the goal that a status is about."""
+        followed = self._goals.get(stamp)
+        if followed is not None:
+            earlier = followed.earlier
+            if earlier is not None and not earlier.state.ended:
+                # The later one is accepted or refused first. If it was refused, the controller repeats
+                # the state of the earlier one.
+                answers = state in (GoalState.ACCEPTED, GoalState.ABORTED)
+                if followed.state.ended:
+                    answers = state is GoalState.ACCEPTED is not earlier.state
+                return followed if answers else earlier
+            if not (stamp == UNSTAMPED and followed.state.ended and state.active):
+                return followed
+        followed = FollowedGoal(None, stamp)
+        self._remember(followed)
+        return followed
+
+    def _remember(self, followed: FollowedGoal[G]) -> None:
+        self._goals.pop(followed.stamp, None)
+        self._goals[followed.stamp] = followed
+        if len(self._goals) > MAX_KNOWN:
+            del self._goals[next(iter(self._goals))]

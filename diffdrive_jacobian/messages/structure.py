@@ -1,21 +1,19 @@
-"""Types of the fields of messages, from a message class or from a definition in a bag.
+"""Types of the fields of messages, and the fields of message objects by their paths.
 
-Both give the same `Structure`, so what reads, writes, compares or changes fields needs no other
-description of a message. None of it needs rclpy.
+A message class and a definition in a bag give the same `Structure`. None of this needs rclpy.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeAlias
 
-from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import import_type
 
-_CODES = {
+CODES = {
     'boolean': '?',
     'octet': 'c',
     'int8': 'b',
@@ -31,25 +29,11 @@ _CODES = {
 }
 """Format characters of the module `struct`, by the names that rosidl gives the types of numbers."""
 _SIZES = {'?': 1, 'c': 1, 'b': 1, 'B': 1, 'h': 2, 'H': 2, 'i': 4, 'I': 4, 'q': 8, 'Q': 8, 'f': 4, 'd': 8}
-_IN_DEFINITIONS = {
-    **{name: name for name in _CODES if 'int' in name},
-    **{'bool': 'boolean', 'byte': 'octet', 'char': 'uint8', 'float32': 'float', 'float64': 'double'},
-}
-"""Names of these types in .msg files, and those of rosidl."""
 _NESTED = re.compile(
     r'(?P<array>.+)\[(?P<count>\d+)\]|sequence<(?P<sequence>[^,]+)(?:, (?P<most>\d+))?>'
 )
 _TEXT = re.compile(r'(?P<wide>w?)string(?:<=?(?P<most>\d+)>?)?')
 _CLASS = re.compile(r'(\w+)/(\w+)')
-_LINE = re.compile(
-    r'\s*(?P<type>[A-Za-z][\w/]*(?:<=\d{1,9})?)(?P<nested>\[(?:<=)?\d{,9}\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)',
-    re.ASCII,
-)
-_SEPARATOR = re.compile(r'^=+\nMSG: (\S+)\n', re.MULTILINE)
-
-
-class DefinitionError(MessageError):
-    """A definition of a message type that is invalid or incomplete."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +63,7 @@ class Number:
 
     def __str__(self) -> str:
         """Return the name of the type, as rosidl has it."""
-        return next(name for name, code in _CODES.items() if code == self.code)
+        return next(name for name, code in CODES.items() if code == self.code)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,8 +155,8 @@ def _structure(message_class: Any) -> Structure:
 
 def _of_class(name: str, text: str) -> FieldType:
     """Return a type that rosidl describes, such as `sequence<double, 3>`."""
-    if text in _CODES:
-        return Number(_CODES[text])
+    if text in CODES:
+        return Number(CODES[text])
     if found := _TEXT.fullmatch(text):
         return Text(bool(found['wide']), _number(found['most']))
     if (found := _NESTED.fullmatch(text)) and found['array']:
@@ -183,80 +167,6 @@ def _of_class(name: str, text: str) -> FieldType:
         # Fields of messages are messages; those of services and actions too.
         return structure(import_type(f'{found[1]}/msg/{found[2]}'))
     raise TypeError(f'field {name} must have a type of ROS 2, got {text}')
-
-
-def defined(name: str, text: str) -> Structure:
-    """Return the types of the fields of a message from its definition, as bags store it.
-
-    Args:
-        name: `package/msg/Name`.
-        text: Its .msg file, followed by those of the messages in its fields, each after a line of `=`
-            and one of `MSG: ` and its name.
-
-    Raises:
-        DefinitionError: The definition is invalid, lacks that of a field, or contains itself.
-    """
-    first, *rest = _SEPARATOR.split(text.replace('\r\n', '\n'))
-    texts = {_class_name(one): content for one, content in zip(rest[::2], rest[1::2], strict=True)}
-    try:
-        return _Definitions({**texts, _class_name(name): first}).structure(_class_name(name))
-    except RecursionError as error:
-        raise DefinitionError(f'the definitions in {name} are nested too deep') from error
-
-
-class _Definitions:
-    """The .msg files of a type and of its fields, by `package/Name`."""
-
-    def __init__(self, texts: dict[str, str]) -> None:
-        self._texts = texts
-        self._known: dict[str, Structure | None] = {}
-        """None while it is read."""
-
-    def structure(self, name: str) -> Structure:
-        if name not in self._known:
-            if name not in self._texts:
-                raise DefinitionError(f'the definition of {name} is missing')
-            self._known[name] = None
-            self._known[name] = Structure(name, tuple(self._fields(name)))
-        known = self._known[name]
-        if known is None:
-            raise DefinitionError(f'{name} contains itself')
-        return known
-
-    def _fields(self, name: str) -> Iterator[tuple[str, FieldType]]:
-        package = name.partition('/')[0]
-        for line in self._texts[name].split('\n'):
-            content = line.partition('#')[0]
-            if not content.strip():
-                continue
-            found = _LINE.fullmatch(content)
-            if found is None:
-                raise DefinitionError(f'{name} has the line {line[:80]!r}, which is no field')
-            # What has a value after an equals sign is a constant; other values are defaults.
-            if found['rest'].startswith('='):
-                continue
-            yield found['name'], self._field(package, found['type'], found['nested'])
-
-    def _field(self, package: str, kind: str, nested: str | None) -> FieldType:
-        if kind in _IN_DEFINITIONS:
-            element: FieldType = Number(_CODES[_IN_DEFINITIONS[kind]])
-        elif found := _TEXT.fullmatch(kind):
-            element = Text(bool(found['wide']), _number(found['most']))
-        else:
-            element = self.structure(_class_name(kind if '/' in kind else f'{package}/{kind}'))
-        if nested is None:
-            return element
-        count = nested.strip('[]')
-        if count == '0':
-            raise DefinitionError('an array must have at least 1 element, got 0')
-        if count.isdecimal():
-            return Array(element, int(count))
-        return Sequence(element, _number(count.removeprefix('<=')))
-
-
-def _class_name(name: str) -> str:
-    """Return `package/Name` of `package/msg/Name`."""
-    return name.replace('/msg/', '/')
 
 
 def _number(text: str | None) -> int | None:
@@ -304,3 +214,164 @@ def least_size(kind: FieldType) -> int:
             return kind.count * least_size(kind.element)
         case Structure():
             return max(1, sum(least_size(one) for _, one in kind.fields))
+
+
+LENGTH = re.compile(r'len\(([\w.]+)\)')
+_STEP = re.compile(r'([A-Za-z]\w*)(?:\[(\d+)\])?')
+
+
+def walk(
+    kind: FieldType, value: Any, path: str = '', *, whole: Callable[[FieldType], bool] = lambda _: False
+) -> Iterator[tuple[str, FieldType, Any]]:
+    """Yield path, type and value of each field of a message.
+
+    An array or a sequence of numbers or strings is one value, as are types that are `whole`. One of
+    messages is its length, `len(path)`, and then the fields of its elements, `path[0].x`.
+    """
+    match kind:
+        case _ if whole(kind):
+            yield path, kind, value
+        case Structure() if value is not None:
+            for name, field in kind.fields:
+                inner = f'{path}.{name}' if path else name
+                yield from walk(field, getattr(value, name), inner, whole=whole)
+        case Array(Structure() as element) | Sequence(Structure() as element):
+            yield f'len({path})', COUNT, len(value)
+            for index, one in enumerate(value):
+                yield from walk(element, one, f'{path}[{index}]', whole=whole)
+        case _:
+            yield path, kind, value
+
+
+def plain(value: Any) -> Any:
+    """Return an array or a sequence of numbers or strings as a tuple of Python's; others as they are."""
+    if isinstance(value, (str, bytes, int, float)):
+        return value
+    return tuple(value.tolist() if hasattr(value, 'tolist') else value)
+
+
+def is_stamp(kind: FieldType) -> bool:
+    """Whether a type is a time or a duration, with `sec` and `nanosec`."""
+    return isinstance(kind, Structure) and kind.name in (
+        'builtin_interfaces/Time',
+        'builtin_interfaces/Duration',
+    )
+
+
+def is_identifier(kind: FieldType) -> bool:
+    """Whether a type is a UUID, with the bytes `uuid`."""
+    return isinstance(kind, Structure) and kind.name == 'unique_identifier_msgs/UUID'
+
+
+class MessageField:
+    """A field of a message class: a value, a structure, or all elements of an array of values."""
+
+    def __init__(self, message_class: Any, path: str) -> None:
+        """Find the field by its path, such as `poses[0].pose.position.x`.
+
+        Without an index at its end the path of an array or a sequence means all elements.
+
+        Raises:
+            ValueError: There is no such field. The message names those that there are.
+        """
+        self._steps: list[tuple[str, int | None]] = []
+        kind: FieldType = structure(message_class)
+        for step in path.split('.'):
+            matched = _STEP.fullmatch(step)
+            fields = dict(kind.fields) if isinstance(kind, Structure) else {}
+            if matched is None or matched[1] not in fields:
+                nested = isinstance(kind, (Array, Sequence))
+                there = ', '.join(fields) or ('elements [0], [1], ...' if nested else 'none')
+                raise ValueError(
+                    f"field '{path}' does not exist: {kind} has no {step!r}; its fields: {there}"
+                )
+            kind = fields[matched[1]]
+            index = None if matched[2] is None else int(matched[2])
+            if index is not None:
+                if not isinstance(kind, (Array, Sequence)):
+                    raise ValueError(f"field '{path}' does not exist: '{matched[1]}' has a single value")
+                if isinstance(kind, Array) and index >= kind.count:
+                    raise ValueError(
+                        f"field '{path}' does not exist: '{matched[1]}' has {kind.count} elements"
+                    )
+                kind = kind.element
+            self._steps.append((matched[1], index))
+        self.path = path
+        self.is_array = isinstance(kind, (Array, Sequence))
+        """Whether the field is an array or a sequence with all its elements."""
+        self.type = kind.element if isinstance(kind, (Array, Sequence)) else kind
+        """Type of the value, or of the elements."""
+
+    def replace(self, message: Any, change: Callable[[Any], Any]) -> bool:
+        """Replace the value in a message, or each element of an array, by that which `change` returns.
+
+        `change` may change a structure in place. Return whether there is anything else than before.
+        There is not if the message has no such element.
+        """
+        holder = message
+        *steps, (name, last) = self._steps
+        for step, index in steps:
+            holder = getattr(holder, step)
+            if index is not None:
+                if index >= len(holder):
+                    return False
+                holder = holder[index]
+        if last is None and not self.is_array:
+            old = getattr(holder, name)
+            before = repr(old)
+            setattr(holder, name, new := change(old))
+            return repr(new) != before
+        values = getattr(holder, name)
+        changed = False
+        for index in range(len(values)) if last is None else [last] * (last < len(values)):
+            old = values[index].item() if hasattr(values[index], 'item') else values[index]
+            before = repr(old)
+            values[index] = new = change(old)
+            changed |= repr(new) != before
+        return changed
+
+
+def field_value(message: Any, field: str) -> Any:
+    """Return a field of a message object, as `cdr.Reader` returns it."""
+    length = LENGTH.fullmatch(field)
+    if length:
+        return len(_value(message, length[1]))
+    before, sequence, after = field.partition('[].')
+    if sequence:
+        return tuple(plain(_value(one, after)) for one in _value(message, before))
+    return plain(_value(message, field))
+
+
+def _value(message: Any, path: str) -> Any:
+    for name in path.split('.'):
+        message = getattr(message, name)
+    return message
+
+
+def check_readable(kind: Structure, field: str) -> None:
+    """Raise ValueError unless `cdr.Reader` can return this field."""
+    length = LENGTH.fullmatch(field)
+    found: FieldType = kind
+    steps = (length[1] if length else field).split('.')
+    for step in steps:
+        name = step.removesuffix('[]')
+        inner = dict(found.fields) if isinstance(found, Structure) else {}
+        if name not in inner:
+            raise ValueError(
+                f"a field of {kind.short_name} must be a path to one of its fields, got '{field}'; "
+                f'{name!r} is none of {list(inner)}'
+            )
+        found = inner[name]
+        if step != name and isinstance(found, Sequence):
+            found = found.element
+    if length:
+        readable = isinstance(found, Sequence)
+    else:
+        simple = found.element if isinstance(found, (Array, Sequence)) else found
+        readable = isinstance(simple, (Number, Text)) and field.count('[]') <= 1
+    if not readable:
+        raise ValueError(
+            f'a field of {kind.short_name} must be a number, a string, an array or sequence of them, '
+            f"such a field of each element of one sequence ('goals[].pose'), or len() of a sequence, "
+            f"got '{field}'"
+        )

@@ -1,4 +1,4 @@
-"""The topics of the robot, each said once: what reads, records, draws, checks or shows them asks here.
+"""The topics of the robot, each defined once, and the faults that a topic may have.
 
 A new topic is an entry in `TOPICS`, its codec in `messages.codecs`, and the node that publishes it.
 """
@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from diffdrive_jacobian.messages import codecs
 from diffdrive_jacobian.messages.codecs import Codec
+from diffdrive_jacobian.text import listed
 
 Names = tuple[str, str]
 """Names of the left and the right wheel joint."""
@@ -265,3 +266,99 @@ SENSORS = [topic for topic in TOPICS.values() if topic.units]
 """Topics whose values are tabulated, drawn and shown by their names."""
 READABLE = {topic.base_name: topic for topic in TOPICS.values() if topic.readable}
 """Topics from which a run is read, by their names without namespace."""
+
+
+RUN_TOPICS = tuple(topic.name for topic in TOPICS.values() if topic.recorded)
+"""The topics of a run."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Selection:
+    """Which topics are recorded."""
+
+    topics: tuple[str, ...] = RUN_TOPICS
+    """Names, resolved by the recorder's namespace and remappings."""
+    everything: bool = False
+    """Whether to record every topic that is not hidden."""
+    pattern: str = ''
+    """Regular expression. Topics in whose full name it is found are recorded as well."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TopicFault:
+    """A fault that a topic may have."""
+
+    present: Callable[[int, int], bool]
+    """Returns whether it is present with so many publishers and subscriptions."""
+    log: str
+    """Line of the log, with `{topic}`, `{publishers}`, `{remedy}` and `{killed}`."""
+    finding: str
+    """Finding of the doctor, with `{topic}`, `{publishers}` and `{subscriptions}`."""
+    remedy: Callable[[Topic], str]
+    """Returns what to do about it. Empty: a topic of this kind may be so."""
+    problem: bool = True
+    """Whether something does not work with it."""
+
+    def logged(self, topic: str, known: Topic, publishers: list[str]) -> str:
+        """Return the line for the log of a node.
+
+        Args:
+            topic: Fully qualified name of the topic.
+            known: The topic before it is remapped.
+            publishers: The nodes that publish it.
+        """
+        # The graph keeps a node that was killed for 20 s, also beside its successor.
+        repeated = len({*publishers}) < len(publishers)
+        return self.log.format(
+            topic=topic,
+            publishers=listed(publishers),
+            remedy=self.remedy(known),
+            killed='; one that was killed disappears within 20 s' if repeated else '',
+        )
+
+    def found(self, topic: str, publishers: list[str], subscriptions: list[str]) -> str:
+        """Return the finding of the doctor, without what to do about it."""
+        return self.finding.format(
+            topic=topic, publishers=listed(publishers), subscriptions=listed(subscriptions)
+        )
+
+
+def _start(program: str, known: Topic) -> str:
+    return f'{program} {SAME_NAMES.format(known.name)}' if program else ''
+
+
+UNREAD = TopicFault(
+    present=lambda publishers, subscriptions: publishers > 0 and subscriptions <= 0,
+    log='no node is subscribed to {topic}: {remedy}',
+    finding='{publishers} publishes {topic}, but nobody subscribes to it',
+    remedy=lambda known: _start(known.if_unread, known),
+)
+GOALS_LOST = replace(
+    UNREAD,
+    log='{publishers} publishes {topic}, but no controller is subscribed to it, so that goals are lost: '
+    '{remedy}',
+)
+UNPUBLISHED = TopicFault(
+    present=lambda publishers, subscriptions: subscriptions > 0 and not publishers,
+    log='no node publishes {topic}: {remedy}',
+    finding='{subscriptions} subscribes to {topic}, but nobody publishes it',
+    remedy=lambda known: _start(known.if_unpublished, known),
+)
+SEVERAL = TopicFault(
+    present=lambda publishers, subscriptions: publishers > 1,
+    log='{publishers} publish {topic}: {remedy}{killed}',
+    finding='{publishers} publish {topic}',
+    remedy=lambda known: known.if_several,
+)
+ALTERNATING = TopicFault(
+    present=SEVERAL.present,
+    log='{publishers} publish {topic}, and their commands alternate: stop one of them, or put a '
+    'multiplexer such as twist_mux between',
+    finding='{publishers} publish {topic}: the robot follows the last command of either',
+    remedy=lambda known: (
+        'drive by hand only while no goal is active, or use a multiplexer such as twist_mux'
+        if known.name == 'cmd_vel'
+        else ''
+    ),
+    problem=False,
+)

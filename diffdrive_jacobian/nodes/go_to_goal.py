@@ -36,7 +36,7 @@ from diffdrive_jacobian.messages.codecs import (
     Route,
 )
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_WAYPOINTS, MessageError
-from diffdrive_jacobian.messages.topic_faults import SEVERAL, UNREAD
+from diffdrive_jacobian.messages.topics import SEVERAL, UNREAD
 from diffdrive_jacobian.nodes.other_drivers import OtherDrivers
 from diffdrive_jacobian.nodes.stopping import overshoot_warnings, rolls_on
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters

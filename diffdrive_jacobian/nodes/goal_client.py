@@ -32,8 +32,7 @@ from diffdrive_jacobian.messages.codecs import (
     pose_fields,
 )
 from diffdrive_jacobian.messages.conversion import MessageError, from_pose, from_time
-from diffdrive_jacobian.messages.goal_follower import GoalFollower
-from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.messages.goal_status import GoalFollower, GoalState
 from diffdrive_jacobian.messages.names import is_named, node_of
 from diffdrive_jacobian.ros.node import THROTTLE, explaining_failure
 from diffdrive_jacobian.ros.serialization import ignoring_invalid

@@ -39,9 +39,8 @@ from diffdrive_jacobian.messages.codecs import (
     Place,
     Wheels,
 )
-from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.covariances import from_covariance
-from diffdrive_jacobian.messages.topic_faults import GOALS_LOST, SEVERAL, UNPUBLISHED
+from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
+from diffdrive_jacobian.messages.topics import GOALS_LOST, SEVERAL, UNPUBLISHED
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.ros.graph_faults import Interleaving, topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode

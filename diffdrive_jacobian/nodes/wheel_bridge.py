@@ -18,7 +18,7 @@ from diffdrive_jacobian.messages.codecs import (
     Wheels,
 )
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.topic_faults import UNREAD
+from diffdrive_jacobian.messages.topics import UNREAD
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
 from diffdrive_jacobian.ros.graph_faults import Interleaving, topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode

@@ -13,8 +13,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from diffdrive_jacobian.bags.run import Run, Series
-from diffdrive_jacobian.bags.time_series import commanded, limits, line, measured
-from diffdrive_jacobian.bags.timeline import Array, Timeline, jumps, seconds, timeline, tolerance
+from diffdrive_jacobian.bags.timeline import (
+    Array,
+    Timeline,
+    commanded,
+    jumps,
+    limits,
+    line,
+    measured,
+    seconds,
+    timeline,
+    tolerance,
+)
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension
 from diffdrive_jacobian.plots.rendering import render, styled

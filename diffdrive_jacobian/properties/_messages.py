@@ -13,8 +13,7 @@ from rclpy.serialization import deserialize_message
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 from diffdrive_jacobian.messages.codecs import POSE_IN, TWIST_IN, pose_fields, twist_fields
-from diffdrive_jacobian.messages.fields import field_value
-from diffdrive_jacobian.messages.structure import structure
+from diffdrive_jacobian.messages.structure import field_value, structure
 
 
 class Pose(NamedTuple):

@@ -12,8 +12,14 @@ from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, STAMP, Status
-from diffdrive_jacobian.messages.goal_follower import UNSTAMPED, FollowedGoal, GoalFollower, Stamp
-from diffdrive_jacobian.messages.goal_status import FOLLOWING, GoalState
+from diffdrive_jacobian.messages.goal_status import (
+    FOLLOWING,
+    UNSTAMPED,
+    FollowedGoal,
+    GoalFollower,
+    GoalState,
+    Stamp,
+)
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name, Names
 from diffdrive_jacobian.properties._messages import Pose, Twist, field_reader, planar, read_twist

@@ -10,14 +10,17 @@ from typing import TYPE_CHECKING
 from diffdrive_jacobian import lazy
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.recording.playback import COMMANDS, GOALS, NothingToPlayError, Playback
-    from diffdrive_jacobian.recording.playing import (
+    from diffdrive_jacobian.recording.replaying import (
+        COMMANDS,
+        GOALS,
+        NothingToPlayError,
+        Playback,
+        Replayer,
         ReplayProgress,
         ReplayResult,
         describe_too_few,
         replay,
     )
-    from diffdrive_jacobian.recording.replayer import Replayer
 
 __all__ = [
     'COMMANDS',
@@ -35,14 +38,14 @@ if not TYPE_CHECKING:
     __getattr__, __dir__ = lazy.attach(
         __name__,
         {
-            'COMMANDS': 'recording.playback',
-            'GOALS': 'recording.playback',
-            'NothingToPlayError': 'recording.playback',
-            'Playback': 'recording.playback',
-            'ReplayProgress': 'recording.playing',
-            'ReplayResult': 'recording.playing',
-            'Replayer': 'recording.replayer',
-            'describe_too_few': 'recording.playing',
-            'replay': 'recording.playing',
+            'COMMANDS': 'recording.replaying',
+            'GOALS': 'recording.replaying',
+            'NothingToPlayError': 'recording.replaying',
+            'Playback': 'recording.replaying',
+            'ReplayProgress': 'recording.replaying',
+            'ReplayResult': 'recording.replaying',
+            'Replayer': 'recording.replaying',
+            'describe_too_few': 'recording.replaying',
+            'replay': 'recording.replaying',
         },
     )

@@ -1,16 +1,13 @@
-"""Reception of the messages of a topic, whatever quality of service its publishers offer.
-
-Which of them were missed follows from their numbers.
-"""
+"""Reception of the messages of a topic, whatever QoS its publishers offer, and which were missed."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import islice
 from math import inf
-from typing import Any, Protocol
+from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
@@ -34,13 +31,14 @@ from diffdrive_jacobian.ros.rclpy_internals import (
 
 MAX_RUNS = 100
 """Runs of consecutive numbers that are kept of each publisher, to recognize messages received twice."""
+BURST = 1000
+"""Largest number of messages that are taken from a queue at once."""
 
 
 class _Publisher:
     """The numbers received from one publisher, which numbers its messages consecutively."""
 
     def __init__(self, number: int) -> None:
-        """Start with the number of the first received message."""
         self.received = 1
         self.ended = False
         # First and last number of each run, ascending.
@@ -118,33 +116,6 @@ class MissedMessages:
         return message.sent
 
 
-BURST = 1000
-"""Largest number of messages that are taken from a queue at once."""
-
-
-class Reception(Protocol):
-    """Receives the messages of a topic."""
-
-    @property
-    def missed(self) -> int:
-        """Number of messages that are known to be missed."""
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether messages may be missed of which nothing is known."""
-
-    @property
-    def confirmed(self) -> Set[bytes]:
-        """Reliable publishers (GID) that have delivered all that they sent before the end."""
-
-    def match(self, offered: Sequence[QoSProfile]) -> None:
-        """Receive from publishers with these profiles, too.
-
-        Raises:
-            RuntimeError, NameValidationException: The topic cannot be subscribed to.
-        """
-
-
 class CallbackReception:
     """Receives from one subscription, whose callback an executor calls.
 
@@ -154,7 +125,7 @@ class CallbackReception:
 
     missed = 0
     doubtful = False
-    confirmed: Set[bytes] = frozenset()
+    confirmed: frozenset[bytes] = frozenset()
 
     def __init__(
         self, node: Node, kind: type, topic: str, depth: int, callback: Callable[[bytes], None]
@@ -165,7 +136,11 @@ class CallbackReception:
         self._subscription: Subscription | None = None
 
     def match(self, offered: Sequence[QoSProfile]) -> None:
-        """Subscribe, or replace a subscription that is too strict for one of the publishers."""
+        """Receive from publishers with these profiles, too.
+
+        Raises:
+            RuntimeError, NameValidationException: The topic cannot be subscribed to.
+        """
         before = self._subscription
         if before is None:
             self._subscription = self._create(subscription_profile(offered, self._depth))
@@ -186,12 +161,7 @@ class Queue:
     """A subscription from whose queue messages are taken."""
 
     def __init__(self, subscription: Subscription, receive: Callable[[ReceivedMessage], None]) -> None:
-        """Take messages of a subscription of the group `Polled` later.
-
-        Args:
-            subscription: The subscription.
-            receive: Receives each message.
-        """
+        """Take messages of a subscription of the group `Polled` later, and pass them on."""
         self.subscription = subscription
         self._receive = receive
         self._taken = 0
@@ -217,27 +187,23 @@ class Intake(Waitable):  # type: ignore[misc]
     def __init__(self, node: Node) -> None:
         """Start without queues."""
         super().__init__(node.default_callback_group)
-        self._queues: list[Queue] = []
+        self.queues: list[Queue] = []
         self._ready: list[Queue] = []
         node.add_waitable(self)
 
-    def add(self, queue: Queue) -> None:
-        """Wait for its messages."""
-        self._queues.append(queue)
-
     def take_all(self) -> None:
         """Take all messages that wait."""
-        for queue in self._queues:
+        for queue in self.queues:
             queue.take(queue.subscription.qos_profile.depth)
 
     def get_num_entities(self) -> NumberOfEntities:
         """Return the number of subscriptions."""
-        return NumberOfEntities(num_subs=len(self._queues))
+        return NumberOfEntities(num_subs=len(self.queues))
 
     def add_to_wait_set(self, wait_set: Any) -> None:
         """Add the subscriptions to a wait set."""
         self._indices = [
-            (wait_set.add_subscription(queue.subscription.handle), queue) for queue in self._queues
+            (wait_set.add_subscription(queue.subscription.handle), queue) for queue in self.queues
         ]
 
     def is_ready(self, wait_set: Any) -> bool:
@@ -262,11 +228,9 @@ class CountingReception:
 
     A single subscription that receives from every publisher would demand the least that one of them
     offers: it would lose messages of reliable publishers, and not receive what latched ones sent before.
-    So there is a subscription for each offered combination of reliability and durability. A message that
-    several of them receive is recognized by its publisher and its number.
-
-    A best-effort subscription also receives from reliable publishers, with gaps. What a reliable one
-    receives, too, is taken from that one only: nothing is missing there, and it is in order.
+    So there is a subscription for each offered combination of reliability and durability. A best-effort
+    subscription also receives from reliable publishers, with gaps. What a reliable one receives, too, is
+    taken from that one only: nothing is missing there, and it is in order.
     """
 
     def __init__(
@@ -279,17 +243,7 @@ class CountingReception:
         on_message: Callable[[ReceivedMessage], None],
         is_late: Callable[[ReceivedMessage], bool],
     ) -> None:
-        """Prepare; `match` subscribes.
-
-        Args:
-            node: The node that subscribes.
-            kind: Type of the messages.
-            topic: Name of the topic.
-            depth: Length of the queue of each subscription.
-            intake: Waits for the messages.
-            on_message: Receives each message.
-            is_late: Returns whether a message came after the end of the recording.
-        """
+        """Prepare; `match` subscribes. `is_late` returns whether a message was sent after the end."""
         self._create = partial(
             node.create_subscription, kind, topic, _ignore, raw=True, callback_group=Polled()
         )
@@ -300,6 +254,7 @@ class CountingReception:
         # The first message of each publisher that a reliable subscription received.
         self._reliable_from: dict[bytes, float] = {}
         self.confirmed: set[bytes] = set()
+        """Reliable publishers (GID) that have delivered all that they sent before the end."""
 
     @property
     def missed(self) -> int:
@@ -317,14 +272,13 @@ class CountingReception:
         return any(queue.full for queue in self._queues.values())
 
     def match(self, offered: Sequence[QoSProfile]) -> None:
-        """Subscribe for each combination of reliability and durability that is new."""
+        """As `CallbackReception.match`."""
         for one in offered:
             demanded = one.reliability, one.durability
             if demanded not in self._queues:
                 receive = self._receive_reliable if _is_reliable(demanded) else self._receive_best_effort
-                queue = Queue(self._subscribe(*demanded), receive)
-                self._queues[demanded] = queue
-                self._intake.add(queue)
+                self._queues[demanded] = queue = Queue(self._subscribe(*demanded), receive)
+                self._intake.queues.append(queue)
 
     def _subscribe(self, reliability: ReliabilityPolicy, durability: DurabilityPolicy) -> Subscription:
         profile = QoSProfile(depth=self._depth, reliability=reliability, durability=durability)

@@ -1,37 +1,45 @@
-"""The node that records: it receives topics as raw CDR and adds them to a recording."""
+"""The node that records topics as raw CDR, and a recording by it alone."""
 
 from __future__ import annotations
 
 import json
 import re
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from math import inf
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from rosbags.interfaces import Qos
 
-from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Record, Text
+from diffdrive_jacobian.bags.bag_writer import Summary
+from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.messages.names import full_name
+from diffdrive_jacobian.messages.topics import OF_EVERY_NODE
+from diffdrive_jacobian.messages.topics import Selection as Selection
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 from diffdrive_jacobian.recording.reception import (
     CallbackReception,
     CountingReception,
     Intake,
-    Reception,
 )
-from diffdrive_jacobian.recording.selection import Selection as Selection
+from diffdrive_jacobian.recording.recording import Recording, saved_on_error
 from diffdrive_jacobian.ros.qos import to_rosbags
+from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage, reason
+from diffdrive_jacobian.ros.runner import NodeRunner, ros_context, running
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 
+NAME = 'record_run'
+"""Name of the node."""
 DEPTH = 4000
 """Depth of the queue of each subscription."""
 DRAIN_PATIENCE = 12.0
@@ -55,19 +63,10 @@ OVERHEAD = 768
 """What a message takes up in the buffer of a socket besides its data (bytes)."""
 MAX_REPORT = 500
 """Largest length of the report on a topic (characters)."""
-
-
-class Sink(Protocol):
-    """The recording of a recorder."""
-
-    def add(self, record: Record) -> None:
-        """Add a record."""
-
-    def set_missed(self, topic: str, messages: int) -> None:
-        """Set the number of messages of a topic that are known to be missed so far."""
-
-    def set_left_out(self, topic: str, why: str) -> None:
-        """Note that a topic, or its publishers of one type, are not recorded."""
+DISCOVERY_PERIOD = 0.2
+"""Time between two searches for new topics (s)."""
+WAIT_SHOWN = 0.5
+"""A wait for late messages that is longer than this is shown (s)."""
 
 
 class Recorder(Node):  # type: ignore[misc]
@@ -76,7 +75,7 @@ class Recorder(Node):  # type: ignore[misc]
     def __init__(
         self,
         selection: Selection,
-        sink: Sink,
+        sink: Recording,
         *,
         with_info: bool = False,
         now: Callable[[], int] | None = None,
@@ -98,13 +97,13 @@ class Recorder(Node):  # type: ignore[misc]
         Raises:
             ParameterError: The name of a topic is invalid.
         """
-        super().__init__('record_run', start_parameter_services=False, **kwargs)
+        super().__init__(NAME, start_parameter_services=False, **kwargs)
         self._sink = sink
         self._everything = selection.everything
         self._names = {self._resolved(topic) for topic in selection.topics}
         self._pattern = re.compile(selection.pattern) if selection.pattern else None
         self._channels: dict[str, Channel] = {}
-        self._receptions: dict[str, Reception] = {}
+        self._receptions: dict[str, CallbackReception | CountingReception] = {}
         self._intake = Intake(self) if with_info else None
         self._refused: set[str] = set()
         self._queries: dict[str, ParameterQuery] = {}
@@ -146,8 +145,8 @@ class Recorder(Node):  # type: ignore[misc]
             if topic not in self._channels:
                 self._subscribe(topic, publishers)
             else:
-                self._note_profiles(self._channels[topic], publishers)
-                self._note_types(self._channels[topic], publishers)
+                self._note_changes(self._channels[topic], publishers)
+            if topic in self._channels:
                 self._match(self._channels[topic], publishers)
             for publisher in publishers:
                 self._ask_for_parameters(publisher.node_namespace, publisher.node_name)
@@ -168,9 +167,7 @@ class Recorder(Node):  # type: ignore[misc]
         self.awaited = self._unconfirmed()
 
     def drained(self) -> bool:
-        """Return whether all messages sent before `end` were received, as far as can be determined.
-
-        Or the time for them is over: `give_up` is then called.
+        """Return whether all messages sent before `end` were received, or the time for them is over.
 
         A reliable publisher has delivered all if a message arrives that it sent after the end. Otherwise
         a message may be missing after a burst, which may have exceeded the buffer: the publisher then
@@ -190,7 +187,8 @@ class Recorder(Node):  # type: ignore[misc]
         in_doubt = self.awaited and now - self._last_burst < HEARTBEAT
         if now - self._last_added > IN_TRANSIT and not in_doubt:
             for topic in self._unconfirmed(self._large):
-                self._leave_end_out(topic, 'its last messages are large, and cannot be confirmed')
+                why = 'its last messages are large, and cannot be confirmed'
+                self._sink.set_left_out(f'possibly the end of {topic}', why)
             return True
         if now > self._drain_deadline:
             self.give_up(f'messages were still arriving {DRAIN_PATIENCE:.0f} s after the end')
@@ -200,10 +198,7 @@ class Recorder(Node):  # type: ignore[misc]
     def give_up(self, why: str) -> None:
         """Report that messages sent before `end` may be missing, because it was not waited for them."""
         for topic in self._unconfirmed() or self.topics:
-            self._leave_end_out(topic, why)
-
-    def _leave_end_out(self, topic: str, why: str) -> None:
-        self._sink.set_left_out(f'possibly the end of {topic}', why)
+            self._sink.set_left_out(f'possibly the end of {topic}', why)
 
     def _unconfirmed(self, among: Collection[bytes] | None = None) -> list[str]:
         """Return the topics with a reliable publisher, among these or all, of which more may come."""
@@ -236,8 +231,7 @@ class Recorder(Node):  # type: ignore[misc]
     def _wants(self, topic: str) -> bool:
         if topic in self._names:
             return True
-        hidden = any(part.startswith('_') for part in topic.split('/'))
-        if self._everything and not hidden:
+        if self._everything and '/_' not in topic:
             return True
         return self._pattern is not None and self._pattern.search(topic) is not None
 
@@ -261,9 +255,15 @@ class Recorder(Node):  # type: ignore[misc]
             qos=_profiles(publishers),
         )
         self._channels[topic] = channel
-        self._receptions[topic] = self._reception(channel, message)
+        if self._intake is None:
+            on_data = partial(self._on_data, channel.id)
+            self._receptions[topic] = CallbackReception(self, message, topic, DEPTH, on_data)
+        else:
+            on_message = partial(self._on_message, channel.id)
+            self._receptions[topic] = CountingReception(
+                self, message, topic, DEPTH, self._intake, on_message, self._is_late
+            )
         self._sink.add(channel)
-        self._match(channel, publishers)
 
     def _match(self, channel: Channel, publishers: list[Any]) -> None:
         try:
@@ -273,15 +273,6 @@ class Recorder(Node):  # type: ignore[misc]
         except (RuntimeError, NameValidationException) as error:
             self._leave_out(channel.topic, reason(error))
 
-    def _reception(self, channel: Channel, message: type) -> Reception:
-        if self._intake is None:
-            on_data = partial(self._on_data, channel.id)
-            return CallbackReception(self, message, channel.topic, DEPTH, on_data)
-        on_message = partial(self._on_message, channel.id)
-        return CountingReception(
-            self, message, channel.topic, DEPTH, self._intake, on_message, self._is_late
-        )
-
     def _leave_out(self, topic: str, why: str) -> None:
         """Report once that a topic, or its publishers of one type, are not recorded."""
         self._refused.add(topic)
@@ -289,15 +280,12 @@ class Recorder(Node):  # type: ignore[misc]
         # Other processes choose the names.
         self.get_logger().error(printable(f'{topic} is not recorded: {why}', MAX_REPORT))
 
-    def _note_profiles(self, channel: Channel, publishers: list[Any]) -> None:
-        profiles = _profiles(publishers)
-        new = tuple(one for one in profiles if one not in channel.qos)
-        if new:
+    def _note_changes(self, channel: Channel, publishers: list[Any]) -> None:
+        """Note new profiles and types of the publishers."""
+        if new := tuple(one for one in _profiles(publishers) if one not in channel.qos):
             channel = replace(channel, qos=channel.qos + new)
             self._channels[channel.topic] = channel
             self._sink.add(channel)
-
-    def _note_types(self, channel: Channel, publishers: list[Any]) -> None:
         for other in {one.topic_type for one in publishers} - {channel.type_name}:
             if (mismatch := f'{channel.topic} of {other}') not in self._refused:
                 self._leave_out(mismatch, f'{channel.topic} is recorded as {channel.type_name}')
@@ -353,3 +341,120 @@ class Recorder(Node):  # type: ignore[misc]
 def _profiles(publishers: list[Any]) -> tuple[Qos, ...]:
     """Return the distinct offered QoS profiles."""
     return tuple(dict.fromkeys(to_rosbags(one.qos_profile) for one in publishers))
+
+
+# --- A recording by this node alone
+
+
+class Status(NamedTuple):
+    """The state of a recording."""
+
+    messages: int
+    """Number of messages received."""
+    topics: int
+    """Number of topics."""
+    size: int
+    """Size of the journal (bytes)."""
+    seconds: float
+    """Time since the start (s)."""
+    lost: int
+    """Number of messages that are known to be lost."""
+    missing: tuple[str, ...] = ()
+    """Topics that were selected by name and had no publisher so far, fully qualified."""
+    published: tuple[str, ...] = ()
+    """Topics of other nodes that have a publisher, if no topic is recorded. For messages."""
+
+
+def record(
+    recording: Recording,
+    selection: Selection,
+    *,
+    max_duration: float | None,
+    ros_arguments: Sequence[str],
+    signals: Signals,
+    on_status: Callable[[Status], object],
+    on_wait: Callable[[Sequence[str]], object],
+    on_end: Callable[[], object],
+) -> Summary:
+    """Record until a signal is caught, the time is over, ROS is shut down or the disk fails.
+
+    Args:
+        recording: Where to record. It is finished, or discarded on a `UserError`.
+        selection: Which topics.
+        max_duration: Longest duration (s). None: no limit.
+        ros_arguments: ROS arguments of the node.
+        signals: Counter of the signals that end the recording.
+        on_status: Receives the status, several times a second.
+        on_wait: Called if late messages are waited for at the end, with their topics.
+        on_end: Called when nothing more is received, before the bag is written.
+
+    Returns:
+        What the bag contains.
+
+    Raises:
+        UserError: The ROS arguments are invalid.
+        RecordingError: The recording is not complete.
+    """
+    if not signals.count:
+        with (
+            saved_on_error(recording),
+            ros_context([NAME, *ros_arguments]) as context,
+            running(context, isolated=False, with_info=True) as runner,
+        ):
+            recorder = runner.add(
+                lambda: Recorder(selection, recording, with_info=True, context=context)
+            )
+            discovery = TokenBucket(1, DISCOVERY_PERIOD)
+
+            def failed() -> bool:
+                if discovery.permits(time.monotonic()):
+                    recorder.discover()
+                    on_status(_status(recorder, recording))
+                return recording.error is not None
+
+            left = inf if max_duration is None else recording.started + max_duration - time.monotonic()
+            if not runner.spin(failed, timeout=left, signals=signals) and context.ok():
+                _drain(recorder, runner, signals, on_wait)
+    on_end()
+    return recording.finish()
+
+
+def _drain(
+    recorder: Recorder,
+    runner: NodeRunner,
+    signals: Signals,
+    on_wait: Callable[[Sequence[str]], object],
+) -> None:
+    """Receive what was sent before now, until a further signal."""
+    recorder.end()
+    before = signals.count
+    drained = runner.spin(recorder.drained, timeout=WAIT_SHOWN, signals=signals, handled=before)
+    if not drained:
+        if recorder.awaited and signals.count == before:
+            on_wait(recorder.awaited)
+        drained = runner.spin(recorder.drained, signals=signals, handled=before)
+    if not drained and signals.count > before:
+        recorder.give_up('a second signal ended the wait for late messages')
+
+
+def _status(recorder: Recorder, recording: Recording) -> Status:
+    return Status(
+        messages=recorder.messages,
+        topics=len(recorder.topics),
+        size=recording.journal.size,
+        seconds=time.monotonic() - recording.started,
+        lost=sum(recording.lost.values()),
+        missing=tuple(recorder.missing),
+        published=() if recorder.topics else tuple(_published(recorder)),
+    )
+
+
+def _published(node: Node) -> list[str]:
+    """Return the topics that have a publisher. Those that every node publishes are left out."""
+    found = []
+    for topic, _ in sorted(node.get_topic_names_and_types()):
+        # A DDS application without ROS can use any name.
+        with suppress(ValueError, NameValidationException):
+            if topic not in OF_EVERY_NODE and node.count_publishers(topic):
+                found.append(topic)
+    return found

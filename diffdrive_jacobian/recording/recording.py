@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -19,50 +20,137 @@ from diffdrive_jacobian.bags.bag_writer import (
     check_target,
     describe_too_large,
 )
+from diffdrive_jacobian.bags.bounded_reader import MAX_MESSAGE
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import (
     LEFT_OUT,
     LOST,
+    OVERHEAD,
     Channel,
     JournalWriter,
     Message,
     Record,
     Text,
 )
-from diffdrive_jacobian.bags.limits import MAX_MESSAGE
-from diffdrive_jacobian.bags.salvage_mcap import Topic, read_mcap
-from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.bags.salvage import Topic, read_mcap
+from diffdrive_jacobian.errors import DiffdriveError, UserError
 from diffdrive_jacobian.plots.output_files import names_by_time
-from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
 from diffdrive_jacobian.text import printable
 
+FLUSH_PERIOD = 0.1
+"""Period at which records are handed to the operating system (s)."""
+SYNC_PERIOD = 0.3
+"""Period at which they are synced to the disk (s)."""
+CAPACITY = 128 << 20
+"""Memory for records that wait to be written (bytes): four seconds of 1 MB at 30 Hz."""
+EARLY = 4 << 20
+"""Waiting records of this size are written before the period is over (bytes)."""
 MAX_REASON = 500
 """Largest length of the report on a topic that was left out (characters)."""
-
 MAX_LEFT_OUT = 100
 """Largest number of topics that were left out and are named."""
+
+
+class JournalThread:
+    """Writes records to a journal in a thread. Until they are written they wait in bounded memory."""
+
+    def __init__(
+        self,
+        journal: JournalWriter,
+        *,
+        lossless: bool = False,
+        before_sync: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Start the thread.
+
+        Args:
+            journal: Where the records are written.
+            lossless: Whether `add` waits when `CAPACITY` is used up. Otherwise it drops messages.
+            before_sync: Called in the thread before each sync.
+        """
+        self._journal = journal
+        self._lossless = lossless
+        self._before_sync = before_sync
+        self._changed = threading.Condition()
+        self._closing = False
+        self.error: OSError | None = None
+        """Why nothing more can be written. None: no error."""
+        # A daemon: an exception in the main thread must be able to end the process.
+        self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
+        self._thread.start()
+
+    def add(self, record: Record) -> bool:
+        """Queue a record.
+
+        Returns:
+            Whether it was queued. False: the queue is full, which holds for messages only, or writing
+            has failed.
+        """
+        if isinstance(record, Message) and not self._has_room(len(record.data) + OVERHEAD):
+            return False
+        if self._closing or self.error is not None:
+            return False
+        before = self._journal.waiting
+        self._journal.add(record)
+        if before < EARLY <= self._journal.waiting:
+            with self._changed:
+                self._changed.notify_all()
+        return True
+
+    def close(self) -> None:
+        """Write all queued records, however long the disk takes, and end the thread."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join()
+
+    def _has_room(self, size: int) -> bool:
+        def room() -> bool:
+            waiting = self._journal.waiting
+            # A message larger than the capacity is accepted when nothing else waits.
+            return waiting == 0 or waiting + size <= CAPACITY or self.error is not None
+
+        if self._lossless and not room():
+            with self._changed:
+                self._changed.wait_for(room)
+        return room()
+
+    def _run(self) -> None:
+        synced = time.monotonic()
+        while self.error is None:
+            with self._changed:
+                if not self._closing and self._journal.waiting < EARLY:
+                    self._changed.wait(FLUSH_PERIOD)
+                closing = self._closing
+            try:
+                if closing or time.monotonic() - synced >= SYNC_PERIOD:
+                    self._before_sync()
+                    self._journal.flush()
+                    self._journal.sync()
+                    if not self._journal.in_place():
+                        raise OSError(f'{self._journal.path} was removed, renamed or replaced')
+                    synced = time.monotonic()
+                else:
+                    self._journal.flush()
+            except OSError as error:
+                self.error = error
+            with self._changed:
+                self._changed.notify_all()
+            if closing:
+                return
 
 
 class RecordingError(DiffdriveError):
     """A recording is not complete. The message says why, and where the recorded messages are."""
 
     def __init__(self, message: str, summary: Summary | None = None) -> None:
-        """Create the error.
-
-        Args:
-            message: What happened.
-            summary: Content of the bag. None: there is no bag.
-        """
+        """Create the error, with the content of the bag; None: there is no bag."""
         super().__init__(message)
         self.summary = summary
 
 
 class Recording:
-    """A journal that is on the disk within half a second, and is converted to a bag at the end.
-
-    It is written in a separate thread, so that a slow disk delays no callback. Messages that exceed the
-    capacity of its queue are dropped and counted.
-    """
+    """A journal that is on the disk within half a second, and is converted to a bag at the end."""
 
     def __init__(
         self,
@@ -71,7 +159,6 @@ class Recording:
         *,
         lossless: bool = False,
         replace: bool = False,
-        capacity: int = CAPACITY,
     ) -> None:
         """Start to record. The directory of the bag is created at the end.
 
@@ -80,7 +167,6 @@ class Recording:
             storage: `mcap` or `sqlite3`.
             lossless: Whether `add` waits for a disk that is too slow. Otherwise messages are dropped.
             replace: Whether the bag may replace another one, which stays until then.
-            capacity: Memory for messages that wait to be written (bytes).
 
         Raises:
             FileExistsError: The journal exists, or the bag, and it is not to be replaced or is no bag.
@@ -114,22 +200,7 @@ class Recording:
             self.journal.close()
             journal.unlink()
             raise
-        self._thread = JournalThread(
-            self.journal, capacity=capacity, lossless=lossless, before_sync=self._note_losses
-        )
-
-    @classmethod
-    def named_by_time(cls, prefix: str, storage: str, *, lossless: bool = False) -> Recording:
-        """Start a recording in the current directory, named `PREFIX_DATE-TIME`, or that and a number.
-
-        Raises:
-            OSError: It cannot be written there.
-        """
-        for name in names_by_time(prefix):
-            # Other processes may take the same name.
-            with suppress(FileExistsError):
-                return cls(Path(name), storage, lossless=lossless)
-        raise AssertionError('there is always another name')
+        self._thread = JournalThread(self.journal, lossless=lossless, before_sync=self._note_losses)
 
     @property
     def error(self) -> OSError | None:
@@ -183,7 +254,11 @@ class Recording:
         if not self.journal.in_place():
             self._raise_gone()
         try:
-            self._count_unwritten()
+            if self.error is not None:
+                # Messages that were queued, but could not be written, are lost.
+                written = Counter(one.channel for one in self._read() if isinstance(one, Message))
+                self._dropped += self._added - written + self._too_large
+                self._too_large.clear()
             summary = build_bag(
                 self._channels.values(),
                 chain(self._read(), self._notes()),
@@ -250,7 +325,6 @@ class Recording:
                     yield Message(numbers[found.channel], found.stamp, found.data)
 
     def _by_topic(self, counts: Counter[int]) -> Counter[str]:
-        """Return numbers of messages by topic instead of channel."""
         by_topic: Counter[str] = Counter()
         for channel, number in list(counts.items()):
             by_topic[self._channels[channel].topic] += number
@@ -268,14 +342,6 @@ class Recording:
             if note not in self._noted:
                 self.journal.add(note)
         self._noted = notes
-
-    def _count_unwritten(self) -> None:
-        """Count messages that were queued, but could not be written, as dropped."""
-        if self.error is None:
-            return
-        written = Counter(one.channel for one in self._read() if isinstance(one, Message))
-        self._dropped += self._added - written + self._too_large
-        self._too_large.clear()
 
     def _missing(self) -> str:
         """Return how many messages are neither in the journal nor in the bag; '': none that is known."""
@@ -308,3 +374,45 @@ class Recording:
         raise RecordingError(
             f'{what}. The recorded messages are in {found}: recover_run {found} writes the bag from it'
         )
+
+
+def open_recording(
+    prefix: str, output: str | None, storage: str, *, lossless: bool = False, replace: bool = False
+) -> Recording:
+    """Start a recording to a path of the user, or in the current directory as `PREFIX_DATE-TIME`.
+
+    Raises:
+        OSError: The bag exists or cannot be written. The message names it.
+    """
+    try:
+        if output is not None:
+            return Recording(Path(output), storage, lossless=lossless, replace=replace)
+        for name in names_by_time(prefix):
+            # Other processes may take the same name.
+            with suppress(FileExistsError):
+                return Recording(Path(name), storage, lossless=lossless)
+    except OSError as error:
+        where = output or 'this directory'
+        raise OSError(f'cannot record to {where}: {(error.strerror or str(error)).lower()}') from error
+    raise AssertionError('there is always another name')
+
+
+@contextmanager
+def saved_on_error(recording: Recording | None) -> Iterator[None]:
+    """Finish a recording if an exception is raised; discard it if that is a `UserError`.
+
+    Without an exception the recording stays open.
+    """
+    try:
+        yield
+    except UserError:
+        # Nothing ran.
+        if recording is not None:
+            recording.discard()
+        raise
+    except BaseException:
+        # The first error is the one to report.
+        if recording is not None:
+            with suppress(RecordingError):
+                recording.finish()
+        raise

@@ -21,17 +21,24 @@ from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import Channel, Message, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
-from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.run import read_run
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.messages.fields import is_identifier, plain, walk
-from diffdrive_jacobian.messages.structure import COUNT, Array, FieldType, Sequence, structure
-from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TRANSFORMS
+from diffdrive_jacobian.messages.structure import (
+    COUNT,
+    Array,
+    FieldType,
+    Sequence,
+    is_identifier,
+    plain,
+    structure,
+    walk,
+)
+from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TRANSFORMS, Selection
 from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.plots.run_figure import draw
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
-from diffdrive_jacobian.recording.selection import Selection
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 BAG = 'run'

@@ -43,7 +43,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
-        from diffdrive_jacobian.recording.record import open_recording, saved_on_error
+        from diffdrive_jacobian.recording.recording import open_recording, saved_on_error
 
     goals: Goals = np.empty((0, 3))
     if path is not None:
@@ -183,7 +183,8 @@ def _picture(recording: Recording) -> Path:
 
 def _save(recording: Recording, picture: Path | None, *, replace: bool) -> int:
     """Write the bag and its picture, and print their names; return the exit code."""
-    from diffdrive_jacobian.bags.run_reader import BagError, read_run
+    from diffdrive_jacobian.bags.bag_reader import BagError
+    from diffdrive_jacobian.bags.run import read_run
     from diffdrive_jacobian.plots.run_figure import draw
     from diffdrive_jacobian.recording.recording import RecordingError
 

@@ -8,8 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
-from diffdrive_jacobian.bags.run import Run
-from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.run import Run, read_run
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.topics import READABLE

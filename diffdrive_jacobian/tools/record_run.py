@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.recording.selection import RUN_TOPICS, Selection
+from diffdrive_jacobian.messages.topics import RUN_TOPICS, Selection
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli, _output
@@ -18,7 +18,7 @@ from diffdrive_jacobian.tools._output import counted, describe_bag
 from diffdrive_jacobian.tools.entry_points import DONE, FAILED, long_lived
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.recording.record import Status
+    from diffdrive_jacobian.recording.recorder import Status
 
 PROGRAM = 'record_run'
 STATUS_PERIOD = {True: 0.5, False: 10.0}
@@ -92,8 +92,8 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         parser.error('TOPIC has no effect with --all')
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
-        from diffdrive_jacobian.recording.record import open_recording, record
-        from diffdrive_jacobian.recording.recording import RecordingError
+        from diffdrive_jacobian.recording.recorder import record
+        from diffdrive_jacobian.recording.recording import RecordingError, open_recording
 
     topics = tuple(options.topics)
     selection = Selection(

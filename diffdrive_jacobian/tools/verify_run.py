@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
-from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.run import read_run
 from diffdrive_jacobian.bags.verification import (
     BY_RECORDING_TIME,
     COVARIANCE_TOLERANCE,

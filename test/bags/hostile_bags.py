@@ -8,9 +8,10 @@ from pathlib import Path
 
 import lz4.frame
 
+from diffdrive_jacobian.bags.mcap import MAGIC, record, text
+
 MIB = 1 << 20
 GIB = 1 << 30
-MCAP_MAGIC = b'\x89MCAP0\r\n'
 METADATA = """rosbag2_bagfile_information:
   version: 9
   storage_identifier: {storage}
@@ -56,15 +57,6 @@ def lz4_zeros(size: int) -> bytes:
 # --- MCAP
 
 
-def record(opcode: int, payload: bytes) -> bytes:
-    return struct.pack('<BQ', opcode, len(payload)) + payload
-
-
-def text(value: str | bytes) -> bytes:
-    value = value.encode() if isinstance(value, str) else value
-    return struct.pack('<I', len(value)) + value
-
-
 def chunk(compression: str, packed: bytes, size: int, checksum: int = 0) -> bytes:
     """Return a chunk record; `size` is what it claims to unpack to."""
     head = struct.pack('<QQQI', 1, 1, size, checksum) + text(compression)
@@ -102,7 +94,7 @@ def mcap(
         statistics: Number of messages in the statistics; None: the summary has none.
         end: Time of the last message of each chunk, for the index (ns); that of the first is 1.
     """
-    head = MCAP_MAGIC + record(1, text('ros2') + text('test'))
+    head = MAGIC + record(1, text('ros2') + text('test'))
     data = head + body + record(15, bytes(4))
     start = 0
     if chunks:
@@ -122,7 +114,7 @@ def mcap(
         if statistics is not None:
             head = struct.pack('<QHIIIIQQ', statistics, 1, 1, 0, 0, len(chunks), 1, 1)
             data += record(11, head + text(struct.pack('<HQ', 1, statistics)))
-    return data + record(2, struct.pack('<QQI', start, 0, 0)) + MCAP_MAGIC
+    return data + record(2, struct.pack('<QQI', start, 0, 0)) + MAGIC
 
 
 def chunk_bomb(

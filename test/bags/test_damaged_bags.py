@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 import sys
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,18 +20,20 @@ from rosbags.interfaces import (
 )
 from ruamel.yaml import YAML
 from support.bags import SECOND, odom, start, write_bag
-from support.raw_bags import PLUGINS, data_file, run_tool
+from support.raw_bags import PLUGINS, channel, data_file, run_tool, write_records
 from support.ros_messages import goal, joint_command, twist_stamped
 
 from diffdrive_jacobian.bags import BagError, NothingToSaveError, read_run, recover
-from diffdrive_jacobian.bags.bag_reader import find_damage
+from diffdrive_jacobian.bags.bag_reader import (
+    MetadataError,
+    check_connections,
+    check_metadata,
+    find_damage,
+)
 from diffdrive_jacobian.bags.bag_writer import build_bag
-from diffdrive_jacobian.bags.files import journal_of
-from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, JournalWriter, Message, Text
+from diffdrive_jacobian.bags.journal import PARAMETERS, Message, Text
 from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.bags.metadata import MetadataError, check_connections, check_metadata
-from diffdrive_jacobian.bags.time_series import commanded, limits, measured
-from diffdrive_jacobian.bags.timeline import timeline
+from diffdrive_jacobian.bags.timeline import commanded, limits, measured, timeline
 from diffdrive_jacobian.plots.run_figure import LABELS, draw
 from diffdrive_jacobian.tools import plot_run, recover_run, replay_run
 
@@ -134,7 +137,7 @@ def test_a_damaged_value_is_named_and_recovered(whole, tmp_path, key, changes):
         shutil.copy(whole['mcap'] / 'metadata.yaml', tmp_path)
         edit(tmp_path, *change)
         with pytest.raises(MetadataError) as caught:
-            check_metadata((tmp_path / 'metadata.yaml').read_text())
+            check_metadata(tmp_path / 'metadata.yaml')
         assert 'metadata.yaml' in str(caught.value), change
         assert key in str(caught.value), change
     storage = list(PLUGINS)[len(key) % 2]
@@ -155,7 +158,7 @@ def test_all_tools_agree_on_a_damaged_bag(bag, tmp_path, tools, key, value):
     else:
         # Only the data file shows that it is wrong.
         edit(bag, TOPICS, topic_index(bag), 'topic_metadata', key, value)
-        check_metadata((bag / 'metadata.yaml').read_text())
+        check_metadata(bag / 'metadata.yaml')
     bag = bag.rename(tmp_path / 'a bag')
     named = 'version' if key == 'version' else '/odom'
     for tool in (plot_run, replay_run):
@@ -291,24 +294,17 @@ def test_metadata_that_is_no_map_or_too_deep_is_damage(whole, tmp_path, text):
 
 @pytest.mark.parametrize('text', ['', '{', '[1, 2]', '3', '[' * 10_000, '{"kp": ' + '9' * 5000 + '}'])
 def test_parameters_that_are_none_are_left_out_by_recover_run(tmp_path, text):
-    channel = channel_of('/odom', ODOMETRY)
     records = [
         Text(f'{PARAMETERS}/robot', text),
         Text(f'{PARAMETERS}/other', '{"kp": 3.0}'),
         *(Message(0, i * SECOND, serialize_message(odom(0, 0, 0, seconds=i))) for i in (1, 2)),
     ]
-    build_bag([channel], records, tmp_path / 'bag', 'mcap')
+    build_bag([channel(0, '/odom', ODOMETRY.name)], records, tmp_path / 'bag', 'mcap')
     with pytest.raises(BagError, match=r'parameters of /robot.*recover_run'):
         read_run(tmp_path / 'bag')
     recovery = recover(tmp_path / 'bag')
     assert 'parameters of /robot' in recovery.lost[0]
     assert read_run(recovery.bag).parameters == {'/other': {'kp': 3.0}}
-
-
-def channel_of(topic, known):
-    return Channel(
-        id=0, topic=topic, type_name=known.name, definition=known.text, type_hash=known.type_hash
-    )
 
 
 @pytest.mark.slow
@@ -367,10 +363,8 @@ def test_messages_that_cannot_be_decoded_leave_the_bag_readable(whole, tmp_path,
 
 
 def test_recover_run_says_what_it_did_not_check(tmp_path):
-    channel = Channel(
-        id=0, topic='/x', type_name='my_msgs/msg/Mine', definition='int32 a\n', type_hash='RIHS01_00'
-    )
-    journal = write_journal(tmp_path / 'bag', channel, Message(0, SECOND, b'\0\1\0\0\1\0\0\0'))
+    mine = replace(channel(0, '/x', ODOMETRY.name), type_name='my_msgs/msg/Mine', type_hash='RIHS01_00')
+    journal = write_records(tmp_path / 'bag', mine, Message(0, SECOND, b'\0\1\0\0\1\0\0\0'))
     assert recover(journal).undecodable == (
         'the 1 messages on /x were not checked: their type is not installed as it was recorded',
     )
@@ -390,17 +384,9 @@ def test_messages_that_were_skipped_are_named_where_they_are_missed(whole, tmp_p
 # --- What the message about an unreadable bag says
 
 
-def write_journal(bag, *records):
-    with closing(JournalWriter(journal_of(bag))) as writer:
-        for record in records:
-            writer.add(record)
-        writer.flush()
-    return writer.path
-
-
 def test_a_journal_beside_a_missing_bag_is_named(tmp_path, monkeypatch, tools):
     monkeypatch.chdir(tmp_path)
-    write_journal(tmp_path / 'my crash', Text('storage', 'mcap'))
+    write_records(tmp_path / 'my crash', Text('storage', 'mcap'))
     for tool in (plot_run, replay_run):
         code, _, err = tools(tool, 'my crash')
         assert code == 2
@@ -411,7 +397,7 @@ def test_a_journal_beside_a_missing_bag_is_named(tmp_path, monkeypatch, tools):
 def test_a_bag_that_was_cut_off_is_recovered_by_the_command_that_is_named(bag, tmp_path):
     file = data_file(bag)
     file.write_bytes(file.read_bytes()[:-5000])
-    for given in (bag, file, write_journal(tmp_path / 'x')):
+    for given in (bag, file, write_records(tmp_path / 'x')):
         with pytest.raises(BagError, match=f'`recover_run {given}`'):
             read_run(given)
     (bag / 'metadata.yaml').unlink()

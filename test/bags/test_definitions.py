@@ -6,15 +6,18 @@ Only packages whose share directory has the .msg are imported.
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import pytest
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 from support.bags import SECOND, odom, write_bag
+from support.raw_bags import channel
 
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.bag_writer import build_bag
-from diffdrive_jacobian.bags.journal import Channel, Message
+from diffdrive_jacobian.bags.damaged_bag import definition_and_hash
+from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.bags.message_definitions import (
     UnknownTypeError,
     definition,
@@ -23,8 +26,7 @@ from diffdrive_jacobian.bags.message_definitions import (
     message_class,
     recorded_definition_differs,
 )
-from diffdrive_jacobian.bags.salvage_mcap import Topic
-from diffdrive_jacobian.bags.topic_types import definition_and_hash
+from diffdrive_jacobian.bags.salvage import Topic
 from diffdrive_jacobian.messages.topics import TOPICS
 
 TYPES = sorted({kind for topic in TOPICS.values() for kind in topic.types})
@@ -197,20 +199,10 @@ def test_only_a_valid_hash_tells_another_definition():
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 def test_messages_of_another_definition_are_reported_and_not_misread(tmp_path, storage):
-    channels = [
-        Channel(
-            id=index,
-            topic=topic,
-            type_name='nav_msgs/msg/Odometry',
-            definition='float64 x\n',
-            type_hash=type_hash,
-        )
-        for index, (topic, type_hash) in enumerate(
-            [('/odom', OTHER_HASH), ('/other', definition('nav_msgs/msg/Odometry').type_hash)]
-        )
-    ]
+    odometry, other = (channel(index, f'/{index}', 'nav_msgs/msg/Odometry') for index in (0, 1))
+    odometry = replace(odometry, topic='/odom', definition='float64 x\n', type_hash=OTHER_HASH)
     data = [Message(0, SECOND, serialize_message(odom(1.0, 2.0, 0.5)))]
-    build_bag(channels, data, tmp_path / 'bag', storage)
+    build_bag([odometry, other], data, tmp_path / 'bag', storage)
     run = read_run(tmp_path / 'bag')
     assert len(run.odometry) == 0
     assert run.skipped == {'/odom': 1}

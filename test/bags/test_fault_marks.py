@@ -11,9 +11,8 @@ from std_msgs.msg import String
 from support.bags import SECOND, write_bag
 from support.runs import sample
 
-from diffdrive_jacobian.bags.run_reader import read_run
-from diffdrive_jacobian.bags.time_series import commanded, measured
-from diffdrive_jacobian.bags.timeline import timeline
+from diffdrive_jacobian.bags.run import read_run
+from diffdrive_jacobian.bags.timeline import commanded, measured, timeline
 from diffdrive_jacobian.faults import Push, TimeJump
 from diffdrive_jacobian.plots.run_figure import NAMED, fault_spans, figure
 from diffdrive_jacobian.testing.recorded_run import RecordedRun

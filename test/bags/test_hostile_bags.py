@@ -37,12 +37,12 @@ from support.raw_bags import contents, data_file, make_messages, read_bag, recov
 from support.ros_messages import odometry
 
 from diffdrive_jacobian import bounded_yaml
-from diffdrive_jacobian.bags import BagError, NotABagError, limits, read_run
+from diffdrive_jacobian.bags import BagError, NotABagError, bounded_reader, read_run
 from diffdrive_jacobian.bags import recover as write_recovered
 from diffdrive_jacobian.bags.bag_reader import find_damage, open_bag
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader
 from diffdrive_jacobian.bags.damaged_bag import _unpacked
-from diffdrive_jacobian.bags.salvage_sqlite import _Pages
+from diffdrive_jacobian.bags.salvage import _Pages
 from diffdrive_jacobian.bounded_yaml import MAX_DEPTH, MAX_SIZE, TooLargeError, load_yaml
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.file import robot_parameters
@@ -95,7 +95,7 @@ def test_a_chunk_that_unpacks_to_gigabytes(file, capsys, bomb, indexed):
 
 @pytest.mark.parametrize('indexed', [True, False])
 def test_many_chunks_that_unpack_to_gigabytes_together(file, capsys, monkeypatch, indexed):
-    monkeypatch.setattr(limits, 'FREE', 64 * MIB)
+    monkeypatch.setattr(bounded_reader, 'FREE', 64 * MIB)
     size = 20 * MIB
     file.write_bytes(chunk_bomb('zstd', zstd_zeros(size), size, indexed=indexed, times=100))
     assert_refused(file, r'it unpacks to more than \d+\.\d MB, the most that is read')
@@ -106,7 +106,7 @@ def test_many_chunks_that_unpack_to_gigabytes_together(file, capsys, monkeypatch
 
 def test_chunks_that_overlap_in_time_are_not_unpacked_at_once(file, monkeypatch):
     # A larger file may unpack to that.
-    monkeypatch.setattr(limits, 'FREE', GIB)
+    monkeypatch.setattr(bounded_reader, 'FREE', GIB)
     size = 100 * MIB
     file.write_bytes(chunk_bomb('zstd', zstd_zeros(size), size, indexed=True, times=9, end=2))
     assert_refused(file, 'its chunks overlap in time and unpack to more than 536.9 MB at once')
@@ -116,7 +116,7 @@ def test_chunks_that_overlap_in_time_are_not_unpacked_at_once(file, monkeypatch)
     ('name', 'declared'), [('x.mcap.zstd', True), ('x.mcap.zstd', False), ('x.db3.zstd', False)]
 )
 def test_a_compressed_file_of_zeros(run, capsys, monkeypatch, name, declared):
-    monkeypatch.setattr(limits, 'FREE', 64 * MIB)
+    monkeypatch.setattr(bounded_reader, 'FREE', 64 * MIB)
     storage = 'mcap' if 'mcap' in name else 'sqlite3'
     write_folder(run, name, zstd_zeros(SIZE, declared=declared), mode='FILE', storage=storage)
     assert_refused(run, rf'{name}.* unpacks to .* MB')
@@ -127,7 +127,7 @@ def test_a_compressed_file_of_zeros(run, capsys, monkeypatch, name, declared):
 
 
 def test_compressed_files_have_one_budget_and_are_unpacked_once(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(limits, 'FREE', 40 * MIB)
+    monkeypatch.setattr(bounded_reader, 'FREE', 40 * MIB)
     names = [f'{index}.mcap.zstd' for index in range(3)]
     write_folder(run, ', '.join(names), mode='FILE')
     for name in names:
@@ -159,7 +159,7 @@ def test_highly_compressible_messages_are_read(file):
     """Black images: far less than a thousandth of their size on the disk."""
     data = b'\0\1\0\0' + bytes(24_000_000)
     inner = topic_records() + message(data)
-    packed = limits.zstd.compress(inner)
+    packed = bounded_reader.zstd.compress(inner)
     assert len(packed) < len(inner) / 5000
     file.write_bytes(mcap(chunk('zstd', packed, len(inner))))
     with open_bag(file) as reader:

@@ -14,20 +14,17 @@ import zlib
 from contextlib import closing, suppress
 
 import pytest
-from hostile_bags import MCAP_MAGIC, chunk, record
+from hostile_bags import chunk
 from rclpy.serialization import serialize_message
 from ruamel.yaml import YAML
 from support.bags import SECOND, changed, odom, write_bag
-from support.raw_bags import LATCHED, PLUGINS, data_file
+from support.raw_bags import LATCHED, PLUGINS, channel, data_file, mcap_records, write_records
 from support.ros_messages import goal, joint_command, twist
 
-from diffdrive_jacobian.bags import NotABagError, NothingToSaveError, mcap, recover
+from diffdrive_jacobian.bags import BagError, NotABagError, NothingToSaveError, mcap, read_run, recover
 from diffdrive_jacobian.bags.bag_writer import build_bag
-from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
-from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.bags.run_reader import BagError, read_run
-from diffdrive_jacobian.bags.time_series import commanded, limits, measured
-from diffdrive_jacobian.bags.timeline import timeline
+from diffdrive_jacobian.bags.journal import Message, Text
+from diffdrive_jacobian.bags.timeline import commanded, limits, measured, timeline
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.plots.run_figure import LABELS
@@ -198,7 +195,7 @@ def test_messages(tmp_path):
             for _ in range(chance.choice((0, 1, 3))):
                 data[chance.randrange(4, len(data))] = chance.choice((0, 1, 0x7F, 0x80, 0xFF))
             name = f'{type(message).__module__.split(".")[0]}/msg/{type(message).__name__}'
-            known = channels.setdefault(topic, channel(len(channels), topic, name))
+            known = channels.setdefault(topic, channel(len(channels), topic, name, (LATCHED,)))
             cut = chance.choice((len(data), 12))
             records.append(Message(known.id, round(at * SECOND), bytes(data[:cut])))
         build_bag(channels.values(), records, bag, 'mcap')
@@ -209,53 +206,36 @@ def test_messages(tmp_path):
 # --- Journals
 
 
-def channel(number, topic, name):
-    known = definition(name)
-    return Channel(
-        id=number,
-        topic=topic,
-        type_name=name,
-        definition=known.text,
-        type_hash=known.type_hash,
-        qos=(LATCHED,),
-    )
-
-
 @pytest.fixture(scope='module')
 def journal(tmp_path_factory):
     """The records of a journal without their heads: those outside of its chunk, those in it."""
-    with closing(JournalWriter(tmp_path_factory.mktemp('journal') / 'good.journal.mcap')) as writer:
-        writer.add(Text('storage', 'mcap'))
-        writer.add(Text('parameters of /go_to_goal', json.dumps({'kp': 3.0})))
-        writer.add(channel(0, '/odom', 'nav_msgs/msg/Odometry'))
-        writer.add(channel(1, '/cmd_vel', 'geometry_msgs/msg/Twist'))
-        for second in (1, 2, 3):
-            pose = serialize_message(odom(second, 0, 0, seconds=second))
-            writer.add(Message(0, second * SECOND, pose))
-            writer.add(Message(1, second * SECOND, serialize_message(twist(0.5, 0.0))))
-        writer.flush()
-    *outside, (_, packed) = records_of(writer.path.read_bytes()[len(MCAP_MAGIC) :])
-    head = struct.calcsize('<QQQIIQ')
-    return outside, records_of(packed[head:])
-
-
-def records_of(data):
-    """Return opcode and content of each record."""
-    found = []
-    while data:
-        opcode, length = struct.unpack_from('<BQ', data)
-        found.append([opcode, data[9 : 9 + length]])
-        data = data[9 + length :]
-    return found
+    written = [
+        Text('storage', 'mcap'),
+        Text('parameters of /go_to_goal', json.dumps({'kp': 3.0})),
+        channel(0, '/odom', 'nav_msgs/msg/Odometry', (LATCHED,)),
+        channel(1, '/cmd_vel', 'geometry_msgs/msg/Twist', (LATCHED,)),
+    ]
+    for second in (1, 2, 3):
+        pose = serialize_message(odom(second, 0, 0, seconds=second))
+        written.append(Message(0, second * SECOND, pose))
+        written.append(Message(1, second * SECOND, serialize_message(twist(0.5, 0.0))))
+    path = write_records(tmp_path_factory.mktemp('journal') / 'good', *written)
+    data = path.read_bytes()
+    *outside, (_, start, end) = mcap_records(data)
+    # After opcode, length, times, size, checksum, compression and size of a chunk.
+    inside = data[start + 49 : end]
+    return [[one, data[at + 9 : to]] for one, at, to in outside], [
+        [one, inside[at + 9 : to]] for one, at, to in mcap_records(inside, 0)
+    ]
 
 
 def joined(outside, inside):
     """Return a file in which all checksums are right."""
-    data, parts = b''.join(record(*one) for one in inside), [MCAP_MAGIC]
+    data, parts = b''.join(mcap.record(*one) for one in inside), [mcap.MAGIC]
     for opcode, payload in outside:
         if opcode == mcap.ATTACHMENT:
             payload = payload[:-4] + struct.pack('<I', zlib.crc32(payload[:-4]))
-        parts.append(record(opcode, payload))
+        parts.append(mcap.record(opcode, payload))
     return b''.join([*parts, chunk('', data, len(data), zlib.crc32(data))])
 
 

@@ -70,7 +70,7 @@ def replay(bag):
     from nav_msgs.msg import Odometry
     from rclpy.node import Node
 
-    from diffdrive_jacobian.bags.run_reader import open_bag
+    from diffdrive_jacobian.bags.bag_reader import open_bag
     from diffdrive_jacobian.recording import Playback, Replayer
     from diffdrive_jacobian.ros.runner import ros_context, running
 

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / 'benchmark'))
 from calibration_cases import offenders, one_robot, table_row
 from independent_robots import cramer_rao_bound, simulate
 
-from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.run import read_run
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.calibration import PARAMETERS, Geometry, calibrate
 from diffdrive_jacobian.calibration.data import read_wheels_and_reference

@@ -17,10 +17,10 @@ from diffdrive_jacobian.drives import drive
 from diffdrive_jacobian.live.bag_player import BagPlayer, RecordedRobot, read_robots
 from diffdrive_jacobian.live.commands import CancelGoal, Pause, Seek, SetSpeed, Step
 from diffdrive_jacobian.live.session import Session
+from diffdrive_jacobian.messages.topics import Selection
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording
-from diffdrive_jacobian.recording.selection import Selection
 from diffdrive_jacobian.tools.entry_points import ROS_MODULES
 
 

@@ -14,11 +14,9 @@ from geometry_msgs.msg import (
     Point32,
     Polygon,
     PolygonStamped,
-    Pose,
     PoseStamped,
     PoseWithCovarianceStamped,
     Twist,
-    TwistStamped,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,18 +25,28 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent
 from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
-from rosidl_parser import definition
 from sensor_msgs.msg import JointState, LaserScan
 from std_msgs.msg import Empty, Float64MultiArray, Header, String
 
 from diffdrive_jacobian.messages import cdr
 from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError, Reader, Writer
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.structure import defined
+from diffdrive_jacobian.messages.names import import_type
+from diffdrive_jacobian.messages.structure import (
+    Array,
+    MessageField,
+    Number,
+    Sequence,
+    Structure,
+    Text,
+    field_value,
+    structure,
+    walk,
+)
 
 CLASSES = (
     *(ParameterDescriptor, ParameterEvent),
-    *(Odometry, Twist, TwistStamped, JointState, Clock, Pose, PoseStamped, PoseWithCovarianceStamped),
+    *(Odometry, Twist, JointState, Clock, PoseStamped, PoseWithCovarianceStamped),
     *(Goals, Float64MultiArray, GoalStatus),
 )
 by_class = pytest.mark.parametrize('message_class', CLASSES, ids=lambda one: one.__name__)
@@ -46,90 +54,60 @@ quickly = settings(max_examples=8, deadline=None)
 ENCAPSULATIONS = (b'\0\0', b'\0\1', b'\0\2', b'\0\3', b'\0\6', b'\0\7', b'\0\10', b'\0\11', b'\1\1')
 """Plain CDR, parameter lists and version 2, in both byte orders, and an unknown one."""
 
-INTEGERS = {
-    name: st.integers(low, high)
-    for bits in (8, 16, 32, 64)
-    for name, low, high in (
-        (f'int{bits}', -(1 << bits - 1), (1 << bits - 1) - 1),
-        (f'uint{bits}', 0, (1 << bits) - 1),
-    )
-}
-OTHERS = {'boolean': st.booleans(), 'octet': st.binary(min_size=1, max_size=1)}
-
-
-def is_number(kind):
-    return isinstance(kind, definition.BasicType)
-
-
-def is_text(kind):
-    return isinstance(kind, definition.UnboundedString)
-
-
-def message_type(kind):
-    module = __import__('.'.join(kind.namespaces), fromlist=[kind.name])
-    return getattr(module, kind.name)
-
 
 def values(kind):
-    """Return a strategy for a field, from the types of rosidl."""
-    if is_number(kind):
-        return {**INTEGERS, **OTHERS}.get(kind.typename, st.floats())
-    if is_text(kind):
-        return st.text(max_size=20)
-    if isinstance(kind, definition.NamespacedType):
-        return messages(message_type(kind))
-    if isinstance(kind, definition.Array):
-        # A few different ones, repeated: drawing 36 takes long.
-        few = st.lists(values(kind.value_type), min_size=1, max_size=5)
-        return few.map(lambda some: [some[number % len(some)] for number in range(kind.size)])
-    return st.lists(values(kind.value_type), max_size=min(4, getattr(kind, 'maximum_size', 4)))
+    """Return a strategy for a field."""
+    match kind:
+        case Number(code='?'):
+            return st.booleans()
+        case Number(code='c'):
+            return st.binary(min_size=1, max_size=1)
+        case Number():
+            return st.floats() if kind.is_float else st.integers(*kind.limits)
+        case Text():
+            return st.text(max_size=20)
+        case Structure():
+            return messages(import_type(kind.name.replace('/', '/msg/')))
+        case Array():
+            # A few different ones, repeated: drawing 36 takes long.
+            few = st.lists(values(kind.element), min_size=1, max_size=5)
+            return few.map(lambda some: [some[number % len(some)] for number in range(kind.count)])
+        case Sequence():
+            return st.lists(values(kind.element), max_size=min(4, kind.most or 4))
 
 
 @cache
 def messages(message_class):
-    names = message_class.get_fields_and_field_types()
-    fields = {name: values(kind) for name, kind in zip(names, message_class.SLOT_TYPES, strict=True)}
-    return st.builds(message_class, **fields)
+    fields = structure(message_class).fields
+    return st.builds(message_class, **{name: values(kind) for name, kind in fields})
 
 
-@cache
-def readable(message_class, prefix=''):
+def readable(kind, prefix=''):
     """Return the paths of all fields that a Reader can return."""
     paths = []
-    names = message_class.get_fields_and_field_types()
-    for name, kind in zip(names, message_class.SLOT_TYPES, strict=True):
-        path = prefix + name
-        if isinstance(kind, definition.NamespacedType):
-            paths += readable(message_type(kind), f'{path}.')
-            continue
-        element = getattr(kind, 'value_type', kind)
-        if element is not kind and not isinstance(kind, definition.Array):
+    for name, field in kind.fields:
+        path, element = prefix + name, getattr(field, 'element', field)
+        if isinstance(field, Structure):
+            paths += readable(field, f'{path}.')
+        if isinstance(field, Sequence):
             paths.append(f'len({path})')
-            if isinstance(element, definition.NamespacedType):
-                inner = readable(message_type(element), f'{path}[].')
+            if isinstance(element, Structure):
+                inner = readable(element, f'{path}[].')
                 paths += [one for one in inner if one.count('[]') == 1 and 'len(' not in one]
-        if is_number(element) or is_text(element):
+        if isinstance(element, (Number, Text)):
             paths.append(path)
     return paths
 
 
-def numbers(message, prefix=''):
-    """Return the paths of all numbers of a message that a Writer can write."""
-    paths = []
-    names = message.get_fields_and_field_types()
-    for name, kind in zip(names, message.SLOT_TYPES, strict=True):
-        path, value = prefix + name, getattr(message, name)
-        if is_number(kind):
-            paths.append((path, kind))
-        elif isinstance(kind, definition.NamespacedType):
-            paths += numbers(value, f'{path}.')
-        elif not is_text(kind):
-            for number, one in enumerate(value):
-                if is_number(kind.value_type):
-                    paths.append((f'{path}[{number}]', kind.value_type))
-                elif isinstance(kind.value_type, definition.NamespacedType):
-                    paths += numbers(one, f'{path}[{number}].')
-    return paths
+def numbers(message):
+    """Return the paths and types of all numbers of a message that a Writer can write."""
+    found = {}
+    for path, kind, value in walk(structure(type(message)), message):
+        element = getattr(kind, 'element', kind)
+        if isinstance(element, Number) and not path.startswith('len('):
+            paths = [path] if element is kind else [f'{path}[{one}]' for one in range(len(value))]
+            found.update(dict.fromkeys(paths, element))
+    return found
 
 
 def bits(value):
@@ -141,27 +119,6 @@ def bits(value):
     if isinstance(value, (str, int, bytes)):
         return value
     return tuple(bits(one) for one in (value.tolist() if hasattr(value, 'tolist') else value))
-
-
-def field(message, path):
-    if path.startswith('len('):
-        return len(field(message, path[4:-1]))
-    name, _, rest = path.partition('.')
-    if name.endswith('[]'):
-        return tuple(field(one, rest) for one in getattr(message, name[:-2]))
-    inner = getattr(message, name)
-    return field(inner, rest) if rest else inner
-
-
-def replaced(message, path, value):
-    """Assign a number by its path, such as `goals[1].pose.position.x`."""
-    *way, last = path.replace('[', '.').replace(']', '').split('.')
-    for name in way:
-        message = message[int(name)] if name.isdecimal() else getattr(message, name)
-    if last.isdecimal():
-        message[int(last)] = value
-    else:
-        setattr(message, last, value)
 
 
 def outcome(read, data):
@@ -177,7 +134,7 @@ def rclpy_outcome(message_class, fields, data):
         message = deserialize_message(data, message_class)
     except RuntimeError:
         return None
-    return tuple(bits(field(message, path)) for path in fields)
+    return tuple(bits(field_value(message, path)) for path in fields)
 
 
 def reader(message_class, fields):
@@ -191,7 +148,7 @@ def reader(message_class, fields):
 @quickly
 @given(data=st.data())
 def test_any_fields_are_read_as_rclpy_reads_them(message_class, data):
-    fields = data.draw(st.lists(st.sampled_from(readable(message_class)), unique=True))
+    fields = data.draw(st.lists(st.sampled_from(readable(structure(message_class))), unique=True))
     read = reader(message_class, fields)
     for message in data.draw(st.lists(messages(message_class), min_size=1, max_size=3)):
         serialized = serialize_message(message)
@@ -203,7 +160,7 @@ def test_any_fields_are_read_as_rclpy_reads_them(message_class, data):
 
 def test_numbers_of_four_bytes_are_read_as_rclpy_reads_them():
     scan = LaserScan(angle_min=-0.5, angle_max=0.25, scan_time=0.1, ranges=[1.5, 2.5, 0.1])
-    serialized, fields = serialize_message(scan), readable(LaserScan)
+    serialized, fields = serialize_message(scan), readable(structure(LaserScan))
     assert outcome(reader(LaserScan, fields), serialized) == rclpy_outcome(LaserScan, fields, serialized)
 
 
@@ -217,7 +174,7 @@ LENGTHS = [
 @given(data=st.data())
 def test_damaged_or_random_bytes_are_refused_or_read_as_by_rclpy(message_class, data):
     """Cut off, prolonged, overwritten (lengths too), or under another encapsulation."""
-    fields = readable(message_class)
+    fields = readable(structure(message_class))
     read = reader(message_class, fields)
     serialized = serialize_message(data.draw(messages(message_class)))
     # A layout to be misled by.
@@ -241,7 +198,7 @@ def test_damaged_or_random_bytes_are_refused_or_read_as_by_rclpy(message_class, 
 
 @by_class
 def test_bytes_cut_off_anywhere_are_refused_as_by_rclpy(message_class):
-    fields = readable(message_class)
+    fields = readable(structure(message_class))
     read = reader(message_class, fields)
     message = message_class()
     if hasattr(message, 'header'):
@@ -366,7 +323,7 @@ def test_a_field_that_cannot_be_read_is_an_error():
         with pytest.raises(ValueError, match='a field of Odometry must be'):
             Reader(Odometry, [wrong])
     with pytest.raises(TypeError, match=r'a_msgs/One.text must not be a wide string'):
-        Reader(defined('a_msgs/msg/One', 'int8 number\nwstring text\n'), ['number'])
+        Reader(Structure('a_msgs/One', (('number', Number('b')), ('text', Text(wide=True)))), ['number'])
 
 
 # --- Writing
@@ -377,7 +334,7 @@ def test_a_field_that_cannot_be_read_is_an_error():
 @given(data=st.data())
 def test_numbers_are_written_as_rclpy_writes_them(message_class, data):
     template = data.draw(messages(message_class))
-    kinds = dict(numbers(template))
+    kinds = numbers(template)
     subset = st.sets(st.sampled_from(list(kinds)), max_size=8) if kinds else st.just(set())
     paths = data.draw(subset)
     chosen = [(path, kind) for path, kind in kinds.items() if path in paths]
@@ -386,7 +343,7 @@ def test_numbers_are_written_as_rclpy_writes_them(message_class, data):
     for _ in range(2):
         new = [data.draw(values(kind)) for _, kind in chosen]
         for (path, _), value in zip(chosen, new, strict=True):
-            replaced(message, path, value)
+            MessageField(message_class, path).replace(message, lambda _, value=value: value)
         ours, theirs = write(*new), serialize_message(message)
         assert bits(deserialize_message(ours, message_class)) == bits(
             deserialize_message(theirs, message_class)

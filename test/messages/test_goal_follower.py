@@ -7,8 +7,16 @@ from itertools import product
 import pytest
 from action_msgs.msg import GoalStatus
 
-from diffdrive_jacobian.messages.goal_follower import MAX_KNOWN, UNSTAMPED, Fate, GoalFollower
-from diffdrive_jacobian.messages.goal_status import ACTIVE, ENDED, FOLLOWING, GoalState
+from diffdrive_jacobian.messages.goal_status import (
+    ACTIVE,
+    ENDED,
+    FOLLOWING,
+    MAX_KNOWN,
+    UNSTAMPED,
+    Fate,
+    GoalFollower,
+    GoalState,
+)
 
 ACCEPTED, EXECUTING = GoalState.ACCEPTED, GoalState.EXECUTING
 SUCCEEDED, CANCELED, ABORTED = ENDED

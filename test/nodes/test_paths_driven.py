@@ -14,7 +14,7 @@ from support.processes import Drive, open_world
 from support.ros_messages import goal, odometry, path, receive
 from support.runs import STRAIGHT, run_of
 
-from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.run import read_run
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.control import Path, circle_path, line_path, planned_path
 from diffdrive_jacobian.drives import drive, in_lockstep
@@ -25,7 +25,7 @@ from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.plots.run_figure import figure
 from diffdrive_jacobian.plots.run_table import write_csv
-from diffdrive_jacobian.recording.record import open_recording
+from diffdrive_jacobian.recording.recording import open_recording
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.drive_to import main
 

@@ -28,7 +28,7 @@ from support.ros_messages import (
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.messages.codecs import POSE_WITH_COVARIANCE
-from diffdrive_jacobian.messages.covariances import from_covariance
+from diffdrive_jacobian.messages.conversion import from_covariance
 
 BEGIN = 100 * SECOND
 late = pytest.mark.lockstep(start=100.0)

@@ -24,7 +24,7 @@ from support.ros_messages import twist
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import JournalWriter, Message
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.recording.record import Status
+from diffdrive_jacobian.recording.recorder import Status
 from diffdrive_jacobian.ros.runner import discovery_off, ros_context
 from diffdrive_jacobian.tools import record_run
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from itertools import count
 from pathlib import Path
 
 from action_msgs.msg import GoalStatus
@@ -13,8 +12,8 @@ from rclpy.serialization import serialize_message
 from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags.bag_writer import build_bag
-from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
-from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.bags.journal import PARAMETERS, Message, Text
+from support.raw_bags import channel
 from support.ros_messages import odometry, placement, stamp, twist
 
 SECOND = 1_000_000_000
@@ -24,18 +23,11 @@ REAL = Path(__file__).parents[1] / 'bags' / 'turtlebot3_fake_sqlite'
 
 def write_bag(path, sent, *, parameters=None, storage='mcap'):
     """Write a bag of (seconds, topic, message); parameters are by node."""
-    ids, channels, data = count(), {}, []
+    channels, data = {}, []
     for seconds, topic, message in sent:
         name = f'{type(message).__module__.split(".")[0]}/msg/{type(message).__name__}'
         if (topic, name) not in channels:
-            known = definition(name)
-            channels[topic, name] = Channel(
-                id=next(ids),
-                topic=topic,
-                type_name=name,
-                definition=known.text,
-                type_hash=known.type_hash,
-            )
+            channels[topic, name] = channel(len(channels), topic, name)
         received = round(seconds * SECOND)
         data.append(Message(channels[topic, name].id, received, serialize_message(message)))
     texts = [Text(PARAMETERS + node, json.dumps(values)) for node, values in (parameters or {}).items()]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import struct
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.bags.salvage_mcap import read_mcap
+from diffdrive_jacobian.bags.salvage import read_mcap
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.recover_run import main as recover_run
 
@@ -74,28 +76,33 @@ def write_bag(path, storage, messages, mode=CompressionMode.NONE, told=None):
                 told(count)
 
 
+def channel(number, topic, type_name, qos=()):
+    """Return a topic of an installed type."""
+    known = definition(type_name)
+    return Channel(
+        id=number,
+        topic=topic,
+        type_name=type_name,
+        definition=known.text,
+        type_hash=known.type_hash,
+        qos=qos,
+    )
+
+
+def write_records(bag, *records):
+    """Write the journal of a bag; return its path."""
+    with closing(JournalWriter(journal_of(bag))) as writer:
+        for record in records:
+            writer.add(record)
+        writer.flush()
+    return writer.path
+
+
 def write_journal(bag, messages, storage='mcap'):
     """Write what record_run leaves when it is killed."""
-    writer = JournalWriter(journal_of(bag))
-    writer.add(Text('storage', storage))
-    ids = {}
-    for topic, name in TOPICS.items():
-        found = definition(name)
-        ids[topic] = len(ids)
-        writer.add(
-            Channel(
-                id=ids[topic],
-                topic=topic,
-                type_name=name,
-                definition=found.text,
-                type_hash=found.type_hash,
-            )
-        )
-    for topic, stamp, data in messages:
-        writer.add(Message(ids[topic], stamp, data))
-    writer.flush()
-    writer.close()
-    return writer.path
+    channels = {one: channel(number, one, name) for number, (one, name) in enumerate(TOPICS.items())}
+    records = (Message(channels[topic].id, stamp, data) for topic, stamp, data in messages)
+    return write_records(bag, Text('storage', storage), *channels.values(), *records)
 
 
 def read_journal(path):
@@ -114,6 +121,16 @@ def data_file(bag):
     """Return the only data file of a bag."""
     (file,) = (one for one in bag.iterdir() if one.suffix in ('.mcap', '.db3'))
     return file
+
+
+def mcap_records(data, start=8):
+    """Return opcode, start and end of the records of an MCAP file, or of a chunk from its start."""
+    found = []
+    while start + 9 <= len(data):
+        opcode, length = struct.unpack_from('<BQ', data, start)
+        found.append((opcode, start, start + 9 + length))
+        start += 9 + length
+    return found
 
 
 def edit(file, change):

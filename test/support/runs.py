@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from diffdrive_jacobian.bags.run import COLUMNS, Run, Series
-from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.run import COLUMNS, Run, Series, read_run
 from diffdrive_jacobian.kinematics.se2 import integrate
 from support.bags import SECOND, odom, write_bag
 from support.ros_messages import joint_command

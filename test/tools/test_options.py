@@ -28,7 +28,7 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters import file as configuration_files
 from diffdrive_jacobian.parameters.file import configurations
 from diffdrive_jacobian.recording import NothingToPlayError, Playback, replay
-from diffdrive_jacobian.recording.record import open_recording
+from diffdrive_jacobian.recording.recording import open_recording
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep

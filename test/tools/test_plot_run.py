@@ -18,9 +18,8 @@ from support.bags import REAL, SECOND, changed, odom, start, status, write_bag
 from support.ros_messages import goal, goals, joint_command, twist, twist_stamped
 from support.runs import RATE, STRAIGHT, drive, run_of, sample
 
-from diffdrive_jacobian.bags.run_reader import BagError, read_run
-from diffdrive_jacobian.bags.time_series import BUCKETS, limits, line
-from diffdrive_jacobian.bags.timeline import seconds, timeline
+from diffdrive_jacobian.bags import BagError, read_run
+from diffdrive_jacobian.bags.timeline import BUCKETS, limits, line, seconds, timeline
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.plots import output_files
 from diffdrive_jacobian.plots import run_figure as _figure
