@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from rclpy.node import Node
@@ -21,6 +22,8 @@ CLOCK_TYPE = 'rosgraph_msgs/msg/Clock'
 DESCRIPTIONS = 'type_description_interfaces/'
 """Package of the type of a service that every node has, and that only tools call."""
 Quality = tuple[ReliabilityPolicy, DurabilityPolicy]
+APART = 'lockstep'
+"""Namespace, below the name of a node, of the topics that only this node of its process has."""
 PID = slice(4, 6)
 """Bytes of a GID of Fast DDS with the lower half of the number of its process."""
 
@@ -39,6 +42,28 @@ class NodeGraph(NamedTuple):
     def full_name(self) -> str:
         """Fully qualified name."""
         return full_name(self.namespace, self.name)
+
+    @property
+    def topics(self) -> set[str]:
+        """Names of the topics that it publishes or is subscribed to."""
+        return {*self.publishers, *self.subscriptions}
+
+    def name_in_world(self, topic: str) -> str:
+        """Return the name of a topic without what the rules of `rules_apart` have put before it."""
+        return topic.removeprefix(f'{self.full_name}/{APART}') or topic
+
+
+def shared_topics(nodes: Sequence[NodeGraph]) -> list[str]:
+    """Return the topics that several nodes have, and to which at least one of them is subscribed."""
+    heard = {topic for node in nodes for topic in node.subscriptions}
+    counts = Counter(topic for node in nodes for topic in node.topics)
+    return sorted(topic for topic in heard if counts[topic] > 1)
+
+
+def rules_apart(nodes: Sequence[NodeGraph]) -> list[str]:
+    """Return arguments that give each node of a process topics of its own, below its name."""
+    topics = sorted({topic for node in nodes for topic in node.topics})
+    return ['--ros-args', *(word for topic in topics for word in ('-r', f'{topic}:=~/{APART}{topic}'))]
 
 
 def nodes_beside(node: Node) -> list[NodeGraph]:

@@ -25,6 +25,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
+from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
@@ -71,6 +72,8 @@ UNASKED = 100
 """Largest number of deliveries after which the graph is looked at, although nothing new was told."""
 END = 2.0
 """Time in which a process ends after a process of its nodes has (s)."""
+SYNCHRONOUS = {'RMW_FASTRTPS_PUBLICATION_MODE': 'SYNCHRONOUS'}
+"""Environment of processes: a thread of Fast DDS would publish later what is published at once."""
 ATTEMPTS = 2
 """Number of domains that are tried, if a program that the world has not started comes into one."""
 
@@ -104,19 +107,21 @@ class Command:
             raise _error('cwd must be a path', self.cwd)
         if not isinstance(self.env, Mapping) or not all(map(_is_variable, self.env.items())):
             raise _error("env must be names with texts, {'NAME': 'value'}", self.env)
+        if any(self.env.get(name, value) != value for name, value in SYNCHRONOUS.items()):
+            raise _error(f'env must not differ from {SYNCHRONOUS}: messages would be lost', self.env)
         depth = self.queue_depth
         if isinstance(depth, bool) or not isinstance(depth, int) or not 0 < depth < relays.DEPTH:
             raise _error(f'queue_depth must be an integer from 1 to {relays.DEPTH - 1}', depth)
         for name in ('clock_period', 'timeout', 'patience'):
             checked_nanoseconds(name, getattr(self, name))
 
-    def start(self, domain: Mapping[str, str]) -> ExternalProcess:
-        """Start the process, with environment variables for its ROS domain."""
+    def start(self, domain: Mapping[str, str], rules: Sequence[str]) -> ExternalProcess:
+        """Start the process, with environment variables for its ROS domain, and further arguments."""
         timed = ('--ros-args', '-p', 'use_sim_time:=true') if self.use_sim_time else ()
         hash_seed = {} if 'PYTHONHASHSEED' in os.environ else {'PYTHONHASHSEED': '0'}
         return ExternalProcess(
-            [*(os.fspath(part) for part in self.command), *timed],
-            {**domain, **for_other_process(), **hash_seed, **self.env},
+            [*(os.fspath(part) for part in self.command), *timed, *rules],
+            {**domain, **for_other_process(), **hash_seed, **SYNCHRONOUS, **self.env},
             None if self.cwd is None else os.fspath(self.cwd),
         )
 
@@ -188,6 +193,8 @@ class NodeProcess:
         self._ended: list[ExternalProcess] = []
         self._names: set[str] = set()
         """Of all nodes that it has had."""
+        self._rules: list[str] = []
+        """Arguments that give each of its nodes topics of its own, if there are several."""
         self._closing = ExitStack()
         self._reset()
         self._scheduler.links.filter(self._drop_echoes, first=True)
@@ -198,7 +205,12 @@ class NodeProcess:
         self._connected = False
         self._stand_ins: dict[str, StandIn] = {}
         self._relays: dict[tuple[int, str], Relay] = {}
-        self._latched: list[Arrived] = []
+        self._topics: dict[tuple[StandIn, str], str] = {}
+        """Names in the domain of the process, by those in the world."""
+        self._lasting: list[Arrived] = []
+        self._calls: list[Arrived] = []
+        self._unanswered: set[Future] = set()
+        self._held: list[Callable[[], object]] = []
         self._qualities: dict[tuple[int, str], set[graphs.Quality]] = {}
         self._sent: dict[str, list[bytes]] = {}
         self._clock_publishers: dict[str, Publisher] = {}
@@ -298,14 +310,19 @@ class NodeProcess:
         if hasattr(self, 'child'):
             self.child.close()
             self._ended.append(self.child)
-        for attempt in range(ATTEMPTS):
+        attempt = 0
+        while True:
             try:
                 self._launch()
                 self._connect()
-                break
+                if not self._share_topics():
+                    break
+                # Again, with topics of their own.
+                self.close()
             except BaseException as error:
                 self.close()
-                if not isinstance(error, ForeignNodeError) or attempt == ATTEMPTS - 1:
+                attempt += 1
+                if not isinstance(error, ForeignNodeError) or attempt == ATTEMPTS:
                     raise
         self._extend(time.monotonic() - begin)
         return list(self._stand_ins.values())
@@ -327,30 +344,34 @@ class NodeProcess:
         )
         self._closing.callback(self._outside.destroy_node)
         receiving = threads_of_this_process() - before
-        self.child = self._command.start(domain)
+        self.child = self._command.start(domain, self._rules)
         self._quiet = Quiet(self.child.root, receiving)
         self._closing.callback(self._quiet.close)
+        self.child.check_addresses()
         self._listeners = self._quiet.listeners()
         self._datagrams = Datagrams()
         self._datagrams.watch(os.getpid(), but=others)
 
     def join(self) -> None:
         """Add the nodes to the world. They receive the time."""
+        self._add_nodes()
+        self._connected = True
+        (first, *_) = self._stand_ins.values()
+        first.create_timer(self._command.clock_period, self._give_time)
+        first.executor.create_task(self._begin)
+
+    def _add_nodes(self) -> None:
         for name, node in self._stand_ins.items():
             self._nodes.created(node, partial(self._restart, name))
             self._names.add(name)
             if node not in self._scheduler.nodes:
                 self._nodes.check_new(node)
                 self._nodes.add(node, observer=False)
-        self._connected = True
-        (first, *_) = self._stand_ins.values()
-        first.create_timer(self._command.clock_period, self._give_time)
-        first.executor.create_task(self._begin)
 
     def _begin(self) -> None:
-        """Forward what the process has latched before it took part, and give it the time."""
-        latched, self._latched = self._latched, []
-        self._forward(latched)
+        """Forward what the process has sent before it took part, and give it the time."""
+        lasting, self._lasting = self._lasting, []
+        self._forward(lasting)
         self._give_time()
 
     def _restart(self, name: str) -> Node:
@@ -415,16 +436,55 @@ class NodeProcess:
                     )
                 time.sleep(SILENCE)
         self._wait()
+        self._check_order()
         # Others than latched ones came before anybody could be subscribed.
-        self._latched = [arrived for arrived in self._take() if arrived.latched]
+        self._lasting = [arrived for arrived in self._take() if arrived.lasting]
         time.sleep(SILENCE)
         self._wait()
         late = self._take()
-        self._latched += [arrived for arrived in late if arrived.latched]
-        self._refuse([arrived for arrived in late if not arrived.latched])
+        self._lasting += [arrived for arrived in late if arrived.lasting]
+        self._refuse([arrived for arrived in late if not arrived.lasting])
         self._quiet.learn()
         for pid in self._participants:
             self._datagrams.watch(pid)
+
+    def _share_topics(self) -> bool:
+        """Return whether several nodes of the process have a topic that they need not share.
+
+        Which of them receives a message, or the time, first would differ.
+
+        Raises:
+            LockstepError: They share one although they were given topics of their own.
+        """
+        # Others may have been discovered meanwhile.
+        self._learn()
+        found = graphs.nodes_beside(self._outside)
+        shared = graphs.shared_topics(found)
+        if not shared:
+            return False
+        if self._rules:
+            raise LockstepError(
+                f'several nodes of {self.child.title} share {", ".join(shared)}, which start() cannot '
+                'separate: the command remaps it itself, or it was created later; which of them '
+                'receives a message first would differ: start each node by itself'
+            )
+        self._rules = graphs.rules_apart(found)
+        return True
+
+    def _check_order(self) -> None:
+        """Check that every message is received once, so that the order of callbacks is determined.
+
+        Raises:
+            LockstepError: It is not.
+        """
+        for (stand_in, topic), name in self._topics.items():
+            infos = self._outside.get_subscriptions_info_by_topic(name)
+            owner = stand_in.get_fully_qualified_name()
+            if (number := sum(node_of(info) == owner for info in infos)) > 1:
+                raise LockstepError(
+                    f'{owner} has {number} subscriptions to {topic}: which of them receives a message '
+                    'first differs from run to run; it may have one for each topic'
+                )
 
     def _is_matched(self) -> bool:
         """Return whether the world has discovered all endpoints of the process."""
@@ -453,23 +513,27 @@ class NodeProcess:
 
     def _learn_topics(self, graph: graphs.NodeGraph, node: StandIn) -> None:
         outside, name = self._outside, graph.full_name
-        for topic, kind in graph.publishers.items():
-            infos = outside.get_publishers_info_by_topic(topic)
-            profile = self._profile(TOPIC, topic, graphs.qualities_of(infos, name), relays.DEPTH)
-            sent = self._sent.setdefault(topic, [])
-            self._relay(TOPIC, topic, kind, node, relays.from_topic, profile, sent)
-        for topic, kind in graph.subscriptions.items():
+        for own, kind in graph.publishers.items():
+            topic = graph.name_in_world(own)
+            self._topics[node, topic] = own
+            infos = outside.get_publishers_info_by_topic(own)
+            profile = self._profile(TOPIC, own, graphs.qualities_of(infos, name), relays.DEPTH)
+            sent = self._sent.setdefault(own, [])
+            self._relay(TOPIC, own, kind, node, relays.from_topic, topic, profile, sent)
+        for own, kind in graph.subscriptions.items():
+            topic = graph.name_in_world(own)
             if kind == graphs.CLOCK_TYPE and topic.rpartition('/')[2] == 'clock':
-                if topic not in self._clock_publishers:
-                    self._clock_publishers[topic] = outside.create_publisher(Clock, topic, 1)
+                if own not in self._clock_publishers:
+                    self._clock_publishers[own] = outside.create_publisher(Clock, own, 1)
                 continue
+            self._topics[node, topic] = own
             depth = self._command.queue_depth
-            infos = outside.get_subscriptions_info_by_topic(topic)
-            profile = self._profile(INPUT, topic, graphs.qualities_of(infos, name), depth)
-            sent = self._sent.setdefault(topic, [])
+            infos = outside.get_subscriptions_info_by_topic(own)
+            profile = self._profile(INPUT, own, graphs.qualities_of(infos, name), depth)
+            sent = self._sent.setdefault(own, [])
             self._relay(
-                *(INPUT, topic, kind, node, relays.to_topic),
-                *(profile, self._deliver, sent, self._command.patience),
+                *(INPUT, own, kind, node, relays.to_topic),
+                *(topic, profile, self._deliver, sent, self._command.patience),
             )
 
     def _profile(
@@ -514,7 +578,10 @@ class NodeProcess:
         }
         for name, (kind, node) in self._called.items():
             if name in there:
-                self._relay(CALL, name, kind, node, relays.called_service, self._deliver)
+                self._relay(
+                    *(CALL, name, kind, node, relays.called_service),
+                    *(self._respond, self._unanswered),
+                )
 
     def _check_started_by_world(self, graph: graphs.NodeGraph) -> None:
         """Check that a node is in the process or one that it has started."""
@@ -618,21 +685,34 @@ class NodeProcess:
         message = Clock()
         set_time(message.clock, now)
         data = serialize_message(message)
+        # One after the other, so that the nodes of a process do not act at the same time.
+        senders = [raw_sender(publisher) for publisher in self._clock_publishers.values()]
+        sent = [self._exchange(partial(send, data)) for send in senders]
+        return None if any(sent) else FREE
 
-        def send() -> None:
-            for publisher in self._clock_publishers.values():
-                raw_sender(publisher)(data)
+    def _respond(self, send: Callable[[], object]) -> None:
+        """Send a response to the process, and what had to wait for that."""
+        held, self._held = self._held, []
+        for one in (send, *held):
+            self._exchange(one, response=one is send)
 
-        return None if self._exchange(send) else FREE
-
-    def _exchange(self, send: Callable[[], object]) -> int:
+    def _exchange(self, send: Callable[[], object], *, response: bool = False) -> int:
         """Send something to the process, wait until it is quiet, and forward what it has sent.
+
+        Args:
+            send: Sends it.
+            response: Whether it is a response. Others are held while a callback waits for one.
 
         Returns:
             How many messages it has sent.
         """
         if not self._connected:
             return 0
+        if self._quiet.waits_in_callback:
+            self._check_waits()
+            if not response:
+                self._held.append(send)
+                return 0
         begin = time.monotonic()
         if self._services_changed:
             known = len(self._relays)
@@ -668,13 +748,14 @@ class NodeProcess:
         self._learn()
         if len(self._relays) > known:
             self._connect()
-            latched, self._latched = self._latched, []
-            self._forward(latched)
+            self._add_nodes()
+            lasting, self._lasting = self._lasting, []
+            self._forward(lasting)
 
     def _wait(self) -> None:
         """Wait until the process and the threads that receive from it are quiet."""
         try:
-            self._quiet.wait(self._command.patience)
+            self._quiet.wait(self._command.patience, self._asks)
         except LockstepError as error:
             names = ', '.join(self._stand_ins) or self.child.title
             raise LockstepError(
@@ -683,9 +764,27 @@ class NodeProcess:
                 'start(..., patience=)\n' + self.describe()
             ) from None
 
+    def _check_waits(self) -> None:
+        """Check that a callback which waits for a response of the world still does."""
+        self._wait()
+        if not self._quiet.waits_in_callback:
+            raise LockstepError(
+                f'a callback of {", ".join(self._stand_ins)} waited for the response of a service until '
+                f'its timeout, which is wall time, at {self._clocks.now / NANOSECONDS:g} s: it comes '
+                'later in simulated time, or this machine is too slow\n' + self.describe()
+            )
+
+    def _asks(self) -> bool:
+        """Return whether the process waits for responses of the world."""
+        for (role, _), relay in self._relays.items():
+            if role == CALL:
+                self._calls += relay.take()
+        return bool(self._calls or self._unanswered)
+
     def _take(self) -> list[Arrived]:
         """Return what has arrived: messages by the names of their topics, responses, requests."""
-        return [arrived for relay in self._relays.values() for arrived in relay.take()]
+        calls, self._calls = self._calls, []
+        return [*(arrived for relay in self._relays.values() for arrived in relay.take()), *calls]
 
     @staticmethod
     def _forward(arrived: Sequence[Arrived]) -> None:
@@ -716,6 +815,8 @@ class NodeProcess:
     def _refuse(self, arrived: Sequence[Arrived]) -> None:
         """Raise LockstepError if something has arrived."""
         if arrived:
+            # What was lost is sent again, later.
+            self.check_lost(now=True)
             names = ', '.join(self._stand_ins)
             what = ', '.join(dict.fromkeys(one.what for one in arrived))
             raise LockstepError(
@@ -738,9 +839,12 @@ class NodeProcess:
 
     def _drop_echoes(self, end: Source | Link) -> Stage | None:
         """Return the stage that keeps from the process what it has received directly."""
-        own = self._stand_ins.values()
-        if not isinstance(end, Link) or end.owner not in own or (TOPIC, end.topic) not in self._relays:
+        if not isinstance(end, Link) or end.owner not in self._stand_ins.values():
             return None
+        name = self._topics.get((end.owner, end.topic), '')
+        if (TOPIC, name) not in self._relays:
+            return None
+        own = [node for (node, topic), other in self._topics.items() if other == name]
         return relays.without_echo(
             self._scheduler.links.observers_of_published(end.topic).append,
             lambda publisher: any(publisher in node.publishers for node in own),

@@ -35,6 +35,8 @@ NAP = 0.005
 """Period at which the end of a process is checked (s)."""
 LAUNCHER = [sys.executable, '-IS', str(Path(__file__).with_name('launch.py'))]
 """Command that runs another one, and ends all that it has started."""
+ADDR_NO_RANDOMIZE = 0x0040000
+RANDOMIZE = Path('/proc/sys/kernel/randomize_va_space')
 FATAL = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGKILL)
 _numbers = itertools.count()
 
@@ -146,6 +148,19 @@ class ExternalProcess:
                 f'{what}{self.describe()}{"" if self.returncode or node else background}'
             )
 
+    def check_addresses(self) -> None:
+        """Raise LockstepError if the addresses of the process are random."""
+        try:
+            personality = int(Path(f'/proc/{self.root}/personality').read_text(), 16)
+        except OSError:
+            # It has ended, or may not be observed, which is noticed elsewhere.
+            return
+        if not personality & ADDR_NO_RANDOMIZE and RANDOMIZE.read_text().strip() != '0':
+            raise LockstepError(
+                'addresses of processes are random here, and executors call what is ready in the order '
+                'of addresses: a container needs --security-opt seccomp=unconfined'
+            )
+
     @property
     def returncode(self) -> int | None:
         """Exit code, negative if a signal ended it. None: it runs. Its children end with it."""
@@ -162,6 +177,8 @@ class ExternalProcess:
 
     def signal(self, number: int) -> None:
         """Send a signal to it and its children. Nothing happens if it has ended."""
+        if not isinstance(number, int) or number not in signal.valid_signals():
+            raise LockstepError(f'signal takes its number, got {printable(repr(number), 200)}')
         if number == signal.SIGKILL:
             self.kill()
         elif self.returncode is None:

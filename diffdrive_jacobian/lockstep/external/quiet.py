@@ -20,7 +20,7 @@ import platform
 import sys
 import time
 from array import array
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -48,6 +48,8 @@ ENDLESS = (b'0x0', b'0xffffffff', b'0xffffffffffffffff')
 """Timeouts that are none."""
 DDS = 'libfastrtps.so'
 """Library whose waits are those of an idle node."""
+DEEPER = 1024
+"""Size of the part of a stack that a callback uses at least until it waits (bytes)."""
 STACK = 512
 """Size of the part of a stack that is looked at (bytes)."""
 TRIES = 30
@@ -61,6 +63,7 @@ LONGEST = 10
 ASLEEP = (b'S', b'I', b'Z', b'X')
 """States of threads that wait or have ended."""
 STOPPED = (b'T', b't')
+IN_CALLBACK = 'waits in a callback, with a timeout'
 STATES = {b'R': 'is running', b'D': 'waits for a disk', b'T': 'is stopped', b't': 'is being debugged'}
 
 
@@ -159,6 +162,10 @@ class Quiet:
         self._polling: set[int] = set()
         """Threads that wait with a timeout in an idle process, but not in DDS."""
         self._ended: set[int] = set()
+        self.waits_in_callback = False
+        """Whether all was quiet at the last look but for callbacks that wait with a timeout."""
+        self._depths: dict[int, int] = {}
+        """Address of the top of the stack of each thread in an idle process."""
 
     def has_ended(self, pid: int) -> bool:
         """Return whether a process of those that are observed had ended when it was looked at last."""
@@ -181,11 +188,13 @@ class Quiet:
 
     # --- Waiting
 
-    def wait(self, patience: float) -> None:
+    def wait(self, patience: float, asks: Callable[[], bool] = lambda: False) -> None:
         """Wait until all is quiet.
 
         Args:
             patience: Longest time (s), as of `Allowance`.
+            asks: Called if all is quiet but for callbacks that wait with a timeout. Returns whether they
+                wait for responses of the world.
 
         Raises:
             LockstepError: It does not become quiet.
@@ -193,6 +202,8 @@ class Quiet:
         tries = 0
         allowance: Allowance | None = None
         while not self.is_quiet():
+            if self.waits_in_callback and asks():
+                return
             tries += 1
             if tries < TRIES:
                 os.sched_yield()
@@ -210,10 +221,11 @@ class Quiet:
 
     def is_quiet(self) -> bool:
         """Look once. Return whether nothing was being done."""
+        self.waits_in_callback = False
         try:
-            if self._busy is not None and self._is_busy(self._busy):
+            if self._busy is not None and self._is_busy(self._busy) and self._why != IN_CALLBACK:
                 return False
-            self._busy = None
+            self._busy, waiting = None, None
             before = self._times()
             # Ended threads are noticed below.
             newest = os.pread(self._loadavg, 128, 0).rpartition(b' ')[2]
@@ -224,11 +236,16 @@ class Quiet:
             for thread in (*self._threads.values(), *self._own):
                 if self._is_busy(thread):
                     self._busy = thread
-                    return False
+                    if self._why != IN_CALLBACK:
+                        return False
+                    waiting = thread
             # Until a thread that was woken up gets a processor it is in its system call still.
             if any(map(self._is_awake, (*self._threads.values(), *self._own))):
                 return False
-            return self._times() == before
+            if self._times() != before:
+                return False
+            self.waits_in_callback = waiting is not None
+            return waiting is None
         except ProcessLookupError:
             # A thread has ended. The next look is at what is left.
             self._busy, self._newest = None, b''
@@ -286,7 +303,7 @@ class Quiet:
             and arguments[place] not in ENDLESS
             and self._is_in_callback(thread, arguments)
         ):
-            self._why = 'waits in a callback, with a timeout'
+            self._why = IN_CALLBACK
             return True
         thread.idle = call
         return False
@@ -309,6 +326,8 @@ class Quiet:
         timed = []
         for thread in self._threads.values():
             number, *arguments = thread.idle.split() or [b'']
+            if arguments:
+                self._depths[thread.tid] = int(arguments[-2], 16)
             place = self._waits.get(number, NEVER)
             if place != NEVER and arguments[place] not in ENDLESS:
                 timed.append((thread, self._addresses(thread, arguments)))
@@ -319,7 +338,12 @@ class Quiet:
 
     def _is_in_callback(self, thread: _Thread, arguments: list[bytes]) -> bool:
         """Return whether a thread that waits with a timeout does so neither in DDS nor always."""
-        if self._places is None or thread.own or thread.tid in self._polling:
+        if self._places is None or thread.own:
+            return False
+        top = int(arguments[-2], 16)
+        if top < self._depths.get(thread.tid, top) - DEEPER:
+            return True
+        if thread.tid in self._polling:
             return False
         return self._places.isdisjoint(self._addresses(thread, arguments))
 

@@ -33,8 +33,10 @@ from diffdrive_jacobian.ros.rclpy_internals import (
 
 DEPTH = 1000
 """Queue size in the domain of the process: the number of messages of a topic at one simulated time."""
-QUEUE = 10
-"""Queue size of a client."""
+CALLS = QoSProfile(depth=DEPTH)
+"""Quality of service of services and clients."""
+MISSES = 100
+"""Largest number of responses to others that are passed over at once."""
 ONE_DATAGRAM = 60_000
 """Size up to which a message is sent in one datagram (bytes)."""
 TOPIC, INPUT, SERVICE, CALL = range(4)
@@ -46,8 +48,8 @@ class Arrived(NamedTuple):
 
     what: str
     """As in 'published /cmd_vel'."""
-    latched: bool
-    """Whether it is a message for later subscriptions, too."""
+    lasting: bool
+    """Whether it counts if it was sent before the process took part: a latched message, a request."""
     forward: Callable[[], object]
     """Sends it to the world."""
 
@@ -74,28 +76,35 @@ class Relay:
 
 
 def from_topic(
-    outside: Node, inside: Node, topic: str, kind: Any, profile: QoSProfile, sent: list[bytes]
+    outside: Node,
+    inside: Node,
+    name: str,
+    kind: Any,
+    topic: str,
+    profile: QoSProfile,
+    sent: list[bytes],
 ) -> Relay:
     """Return the relay of a topic that a node of the process publishes with this profile.
 
     Args:
         outside: Node in the domain of the process.
         inside: The node of the world.
-        topic: Name of the topic.
+        name: Name of the topic in that domain.
         kind: Type of its messages.
+        topic: Name of the topic in the world.
         profile: Quality of service that the process offers.
         sent: What the world sends to the process now. That arrives here, too, and is not forwarded.
     """
     events = SubscriptionEventCallbacks(message_lost=_nothing, use_default_callbacks=False)
     subscription = outside.create_subscription(
-        kind, topic, _nothing, profile, raw=True, event_callbacks=events
+        kind, name, _nothing, profile, raw=True, event_callbacks=events
     )
     may_lose = profile.reliability == ReliabilityPolicy.BEST_EFFORT
     take_next, release = message_taker(subscription)
     publisher = inside.create_publisher(kind, topic, profile)
 
     def take() -> Iterator[Arrived]:
-        latched = is_latched(subscription)
+        lasting = is_latched(subscription)
         number = 0
         while (taken := take_next(kind, True)) is not None:
             number += 1
@@ -108,7 +117,7 @@ def from_topic(
             if data in sent:
                 sent.remove(data)
             else:
-                yield Arrived(f'published {topic}', latched, partial(publisher.publish, data))
+                yield Arrived(f'published {topic}', lasting, partial(publisher.publish, data))
         if number and may_lose and lost_messages(subscription):
             raise LockstepError(
                 f'messages on {topic} were lost: several were published at once, with best effort'
@@ -120,8 +129,9 @@ def from_topic(
 def to_topic(
     outside: Node,
     inside: Node,
-    topic: str,
+    name: str,
     kind: Any,
+    topic: str,
     profile: QoSProfile,
     deliver: Deliver,
     sent: list[bytes],
@@ -132,14 +142,15 @@ def to_topic(
     Args:
         outside: Node in the domain of the process.
         inside: The node of the world.
-        topic: Name of the topic.
+        name: Name of the topic in that domain.
         kind: Type of its messages.
+        topic: Name of the topic in the world.
         profile: Quality of service that the process requests.
         deliver: Delivers a message.
         sent: Receives what is sent.
         patience: Longest time until a message has arrived (s).
     """
-    publisher = outside.create_publisher(kind, topic, reliable(profile))
+    publisher = outside.create_publisher(kind, name, reliable(profile))
     send_raw = raw_sender(publisher)
 
     def send(data: bytes) -> None:
@@ -158,7 +169,7 @@ def to_topic(
 
 def offered_service(outside: Node, inside: Node, name: str, kind: Any, deliver: Deliver) -> Relay:
     """Return the relay of a service of the process. `deliver` delivers a request."""
-    client = outside.create_client(kind, name)
+    client = outside.create_client(kind, name, qos_profile=CALLS)
     waiting: dict[int, Future] = {}
 
     def on_request(request: Any, _: Any) -> Any:
@@ -174,32 +185,48 @@ def offered_service(outside: Node, inside: Node, name: str, kind: Any, deliver: 
     def take() -> Iterator[Arrived]:
         # Responses to other clients are in the queue, too. They are taken like none.
         misses = 0
-        while waiting and misses <= QUEUE:
+        while waiting and misses <= MISSES:
             if (taken := take_response(client)) is None:
                 misses += 1
             elif (future := waiting.pop(taken[0], None)) is not None:
                 yield Arrived(f'answered {name}', False, partial(future.set_result, taken[1]))
 
-    inside.create_service(kind, name, on_request)
+    inside.create_service(kind, name, on_request, qos_profile=CALLS)
     return Relay(client.service_is_ready, take, client=client)
 
 
-def called_service(outside: Node, inside: Node, name: str, kind: Any, deliver: Deliver) -> Relay:
-    """Return the relay of a service of the world that the process calls. `deliver` sends a response."""
-    service = outside.create_service(kind, name, _nothing)
-    client = inside.create_client(kind, name)
+def called_service(
+    outside: Node, inside: Node, name: str, kind: Any, respond: Deliver, unanswered: set[Future]
+) -> Relay:
+    """Return the relay of a service of the world that the process calls.
+
+    Args:
+        outside: Node in the domain of the process.
+        inside: The node of the world.
+        name: Name of the service.
+        kind: Its type.
+        respond: Sends a response.
+        unanswered: Calls that were not answered yet.
+    """
+    service = outside.create_service(kind, name, _nothing, qos_profile=CALLS)
+    client = inside.create_client(kind, name, qos_profile=CALLS)
 
     def forward(request: Any, header: Any) -> None:
         def answer(future: Future) -> None:
-            # As a task, so that its errors are raised.
-            send = partial(send_response, service, future.result(), header)
-            inside.executor.create_task(deliver, send)
+            def send() -> None:
+                unanswered.discard(future)
+                send_response(service, future.result(), header)
 
-        client.call_async(request).add_done_callback(answer)
+            # As a task, so that its errors are raised.
+            inside.executor.create_task(respond, send)
+
+        called = client.call_async(request)
+        unanswered.add(called)
+        called.add_done_callback(answer)
 
     def take() -> Iterator[Arrived]:
         while (taken := take_request(service)) is not None:
-            yield Arrived(f'called {name}', False, partial(forward, *taken))
+            yield Arrived(f'called {name}', True, partial(forward, *taken))
 
     # A server does not know its clients.
     return Relay(lambda: True, take)
