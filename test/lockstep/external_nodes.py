@@ -190,6 +190,76 @@ class Changing(Repeater):
         self.out = self.create_publisher(String, f'{self.get_name()}/out', qos_profile_sensor_data)
 
 
+class Shared(Controller):
+    """Numbers what it hears on topics that other nodes of its process have, too."""
+
+    def __init__(self, name):
+        super().__init__(name, answers=0)
+        self.heard = 0
+        self.sums = self.create_publisher(String, 'heard', 10)
+        self.create_subscription(String, 'words', self.on_word, 10)
+
+    def on_word(self, word):
+        self.heard += 1
+        self.sums.publish(String(data=f'{self.get_name()} {self.heard} {word.data}'))
+
+
+class Sharing(Shared):
+    """Publishes what the others hear."""
+
+    def __init__(self, name):
+        super().__init__(name)
+        self.words = self.create_publisher(String, 'words', 10)
+
+    def on_odometry(self, odometry):
+        self.words.publish(String(data=f'{odometry.pose.pose.position.x:g}'))
+
+
+class Twice(Controller):
+    """Hears one topic twice."""
+
+    def __init__(self, name):
+        super().__init__(name)
+        self.create_subscription(Odometry, f'{name}/odom', self.on_odometry, 10)
+
+
+class Asking(Controller):
+    """Waits in its callbacks for the responses of a service, with a timeout."""
+
+    def __init__(self, name):
+        super().__init__(name)
+        self.helper = Node(f'{name}_helper', start_parameter_services=False)
+        self.client = self.helper.create_client(Trigger, f'{name}/ask')
+
+    def on_odometry(self, odometry):
+        future = self.client.call_async(Trigger.Request())
+        rclpy.spin_until_future_complete(self.helper, future, timeout_sec=2.0)
+        self.send(float(future.result().message) if future.done() else -1.0)
+
+
+class AskingFirst(Controller):
+    """Calls a service before it spins."""
+
+    def __init__(self, name):
+        super().__init__(name)
+        self.first = self.create_publisher(String, f'{name}/first', LATCHED)
+        client = self.create_client(Trigger, f'{name}/ask')
+        client.wait_for_service()
+        client.call_async(Trigger.Request()).add_done_callback(
+            lambda future: self.first.publish(String(data=future.result().message))
+        )
+
+
+class Growing(Controller):
+    """Creates another node at its first odometry."""
+
+    def on_odometry(self, odometry):
+        super().on_odometry(odometry)
+        if self.received == 1:
+            self.child = Ticker('child')
+            self.executor.add_node(self.child)
+
+
 class Sleeping(Controller):
     def on_odometry(self, odometry):
         time.sleep(0.004)
@@ -297,6 +367,13 @@ NODES = {
     'caller': Caller,
     'late': Late,
     'counting': Counting,
+    'shared': Shared,
+    'other': Shared,
+    'sharing': Sharing,
+    'twice': Twice,
+    'asking': Asking,
+    'asking_first': AskingFirst,
+    'growing': Growing,
     'sleeping': Sleeping,
     'blocking': Blocking,
     'starting': Starting,

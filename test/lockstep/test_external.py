@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import signal
@@ -20,6 +21,7 @@ from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import GetParameters
 from rclpy.action import ActionClient
 from rclpy.node import Node
+from rclpy.task import Future
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 from support.processes import PROGRAM
@@ -232,6 +234,101 @@ def combined(seed):
 
 def test_processes_that_talk_to_one_another_do_the_same_each_time():
     assert combined(0) == combined(1)
+
+
+def test_nodes_of_one_process_that_share_topics_receive_one_after_the_other(lockstep):
+    process = lockstep.start(command('other', 'shared', 'sharing'))
+    assert [node.get_name() for node in process.nodes] == ['other', 'shared', 'sharing']
+    heard = lockstep.listen(String, 'heard')
+    words = lockstep.listen(String, 'words')
+    for number in range(5):
+        lockstep.publish('sharing/odom', odometry(float(number)))
+    assert [one.data for one in words] == ['0', '1', '2', '3', '4']
+    assert [one.data for one in heard] == [
+        f'{name} {number + 1} {number}' for number in range(5) for name in ('sharing', 'other', 'shared')
+    ]
+    # Each sends for itself, and what they send to one another may be lost.
+    report = lockstep.report()
+    assert all(f'/heard: 5 from /{name}' in report for name in ('other', 'shared', 'sharing'))
+    lockstep.inject(Loss('words'))
+    lockstep.publish('sharing/odom', odometry(5.0))
+    lockstep.check_faults()
+    assert [one.data for one in heard[15:]] == ['sharing 6 5']
+
+
+def test_a_node_that_is_created_later_takes_part(lockstep):
+    lockstep.start(command('growing'))
+    lockstep.publish('growing/odom', odometry())
+    lockstep.run_for(0.2)
+    assert lockstep.find('child') is not None
+    commands = lockstep.listen(TwistStamped, 'child/cmd_vel')
+    lockstep.run_for(0.1)
+    assert len(commands) == 2
+
+
+def answer_with_numbers(world, name):
+    """Offer a service that answers with the number of the request."""
+    numbers = itertools.count(1)
+
+    async def answer(_, response):
+        await world.node.executor.create_task(lambda: None)
+        response.message = str(next(numbers))
+        return response
+
+    return world.node.create_service(Trigger, name, answer)
+
+
+def test_a_callback_waits_for_a_service_of_the_world(lockstep):
+    """What else is sent to it meanwhile comes after the response, as do later times."""
+    answer_with_numbers(lockstep, 'asking/ask')
+    lockstep.start(command('asking'))
+    commands = lockstep.listen(TwistStamped, 'asking/cmd_vel')
+    publisher = lockstep.node.create_publisher(Odometry, 'asking/odom', 10)
+    for _ in range(3):
+        publisher.publish(odometry())
+        publisher.publish(odometry())
+        lockstep.run_for(0.03)
+    assert speeds(commands) == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+
+
+def test_a_service_that_does_not_answer_at_once_lets_time_pass(lockstep):
+    slow = []
+
+    async def answer(_, response):
+        future = Future()
+        slow.append(future)
+        await future
+        response.message = '7'
+        return response
+
+    lockstep.node.create_service(Trigger, 'asking/ask', answer)
+    lockstep.start(command('asking'))
+    commands = lockstep.listen(TwistStamped, 'asking/cmd_vel')
+    lockstep.publish('asking/odom', odometry())
+    lockstep.run_for(0.1)
+    assert commands == []
+    slow[0].set_result(None)
+    lockstep.run_for(0.1)
+    assert speeds(commands) == [7.0]
+
+
+def test_a_callback_that_does_not_wait_long_enough_is_an_error(lockstep):
+    lockstep.node.create_service(Trigger, 'asking/ask', never)
+    lockstep.start(command('asking'))
+    lockstep.publish('asking/odom', odometry())
+    time.sleep(2.5)
+    with pytest.raises(LockstepError, match=r'/asking.* waited for the response of a service until its'):
+        lockstep.run_for(0.1)
+
+
+async def never(*_):
+    await Future()
+
+
+def test_a_service_is_called_while_a_process_starts(lockstep):
+    answer_with_numbers(lockstep, 'asking_first/ask')
+    lockstep.start(command('asking_first'))
+    assert [one.data for one in lockstep.listen(String, 'asking_first/first', latched=True)] == ['1']
 
 
 def test_rules_and_parameters_of_the_user_stay(lockstep):
@@ -491,6 +588,26 @@ def refused(arguments, match, **options):
     with Lockstep() as world, pytest.raises(LockstepError, match=match) as raised:
         world.start(arguments, **options)
     return str(raised.value)
+
+
+def test_two_subscriptions_to_one_topic_are_refused():
+    refused(command('twice'), '/twice has 2 subscriptions to /twice/odom: which of them')
+
+
+def test_topics_that_cannot_be_separated_are_refused():
+    refused(
+        [*command('shared', 'other'), '--ros-args', '-r', 'words:=sentences'],
+        'several nodes of .* share /sentences, which',
+    )
+
+
+def test_nodes_of_equal_names_are_refused():
+    refused(command('shared', 'shared'), 'several nodes of .* have the name /shared')
+
+
+def test_random_addresses_are_refused(monkeypatch):
+    monkeypatch.setattr(external_process, 'ADDR_NO_RANDOMIZE', 1)
+    refused(command('echo'), 'seccomp=unconfined')
 
 
 def test_a_node_on_wall_time_is_refused():

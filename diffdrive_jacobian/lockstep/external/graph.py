@@ -70,8 +70,8 @@ def nodes_beside(node: Node) -> list[NodeGraph]:
     """Return the other nodes in the domain of a node, by their names."""
     own = node.get_name(), node.get_namespace()
     found = []
-    for name, namespace in sorted(set(node.get_node_names_and_namespaces()) - {own}):
-        if name == UNKNOWN:
+    for name, namespace in sorted(node.get_node_names_and_namespaces()):
+        if name == UNKNOWN or (name, namespace) == own:
             continue
         parts = [
             {topic: types[0] for topic, types in sorted(names(name, namespace))}

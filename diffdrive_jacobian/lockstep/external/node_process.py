@@ -120,9 +120,10 @@ class Command:
         timed = ('--ros-args', '-p', 'use_sim_time:=true') if self.use_sim_time else ()
         hash_seed = {} if 'PYTHONHASHSEED' in os.environ else {'PYTHONHASHSEED': '0'}
         return ExternalProcess(
-            [*(os.fspath(part) for part in self.command), *timed, *rules],
+            [*(os.fspath(part) for part in self.command), *timed],
             {**domain, **for_other_process(), **hash_seed, **SYNCHRONOUS, **self.env},
             None if self.cwd is None else os.fspath(self.cwd),
+            rules,
         )
 
 
@@ -495,6 +496,12 @@ class NodeProcess:
     def _learn(self) -> bool:
         """Create what the topics and services of the process need. Return whether it has nodes."""
         found = graphs.nodes_beside(self._outside)
+        if len({graph.full_name for graph in found}) < len(found):
+            names = [graph.full_name for graph in found]
+            raise LockstepError(
+                f'several nodes of {self.child.title} have the name '
+                f'{", ".join(sorted({name for name in names if names.count(name) > 1}))}'
+            )
         offered = {name for graph in found for name in graph.services}
         for graph in found:
             self._check_started_by_world(graph)
@@ -795,6 +802,8 @@ class NodeProcess:
         """Check that it runs, lost nothing, and has sent nothing while nothing was delivered to it."""
         if self._connected:
             self.child.check_running(', '.join(self._stand_ins))
+            if self._quiet.waits_in_callback:
+                self._check_waits()
             self._refuse(self._take())
             self.check_lost()
 

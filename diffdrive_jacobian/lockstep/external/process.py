@@ -90,6 +90,7 @@ class ExternalProcess:
         command: Sequence[str],
         environment: Mapping[str, str] | None = None,
         cwd: str | None = None,
+        unnamed: Sequence[str] = (),
     ) -> None:
         """Start it.
 
@@ -97,6 +98,7 @@ class ExternalProcess:
             command: The program and its arguments.
             environment: Variables that differ from those of this process.
             cwd: Its working directory; None: that of this process.
+            unnamed: Further arguments, which errors do not name.
 
         Raises:
             LockstepError: It cannot be started.
@@ -115,7 +117,7 @@ class ExternalProcess:
         }
         try:
             self._process = subprocess.Popen(
-                [*LAUNCHER, *command],
+                [*LAUNCHER, *command, *unnamed],
                 stdin=subprocess.PIPE,
                 stdout=self._files[0],
                 stderr=self._files[1],
