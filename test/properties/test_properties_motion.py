@@ -6,9 +6,11 @@ from math import inf
 from types import SimpleNamespace
 
 import pytest
+from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from property_nodes import Student, goal_at, twist
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import make
 from support.ros_messages import goal
@@ -29,6 +31,7 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.properties import (
     ArrivesOnceFaultsEnd,
     KeepsDriving,
+    NeverFasterThan,
     ReachesGoal,
     Settles,
     StopsAfterLastCommand,
@@ -36,7 +39,7 @@ from diffdrive_jacobian.properties import (
     StopsOnShutdown,
     end_of_faults,
 )
-from diffdrive_jacobian.testing import PropertyViolation
+from diffdrive_jacobian.testing import LockstepError, PropertyViolation
 
 # --- Stopping
 
@@ -272,6 +275,26 @@ def test_a_robot_that_stands_on_its_way(lockstep, robot_at):
         lockstep.run_for(2.0)
     assert 3.5 < raised.value.seconds < 3.56
     assert raised.value.text.startswith('1.54 s after the faults have ended the robot has stood for 0.5')
+
+
+def test_what_another_process_receives_is_not_known(lockstep):
+    """Such properties must not seem to hold. Those of the messages alone are observed."""
+    source = type('Source', (), {'topic_name': '/cmd_vel', 'msg_type': Twist})()
+    message = serialize_message(twist(0.75))
+    for required in (
+        StopsAfterLostOdometry(1.0),
+        StopsOnShutdown(),
+        ArrivesOnceFaultsEnd(1.0),
+        KeepsDriving(1.0),
+    ):
+        lockstep.require(required)
+        with pytest.raises(LockstepError, match='/cmd_vel, which is in another process'):
+            lockstep._scheduler.links.note_external(source, [message])
+        lockstep._properties.required.pop().end()
+    lockstep.require(NeverFasterThan(0.5, 1.0))
+    lockstep._scheduler.links.note_external(source, [message])
+    with pytest.raises(PropertyViolation, match=r'v 0.75 m/s'):
+        lockstep.settle()
 
 
 @pytest.mark.parametrize(
