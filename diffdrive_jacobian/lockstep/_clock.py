@@ -65,10 +65,16 @@ class Clocks:
         """Simulated time (ns), which the clocks show after `set`."""
         self.publisher: Publisher | None = None
         """Publisher of /clock."""
+        self.enabled = True
+        """Whether the time is published."""
         self.pauses = 0
         """Number of faults because of which the clocks stand."""
+        self.publications = 0
+        """Number of messages on /clock."""
         self._clocks: list[SimulatedClock] = []
         self._message = Clock()
+        self._shown = 0
+        self._announced = 0
 
     def find(self, nodes: Iterable[Node]) -> set[Subscription]:
         """Find the clocks of nodes. Return the subscriptions to /clock that are replaced.
@@ -87,12 +93,25 @@ class Clocks:
 
     def set(self) -> None:
         """Set the clocks to the present time, and publish it if somebody else receives it."""
-        now = self.now
+        now = self._shown = self.now
         time = Time(nanoseconds=now, clock_type=ClockType.ROS_TIME)
         for clock in self._clocks:
             clock.set(time)
-        if self.publisher is not None and self.publisher.get_subscription_count() > len(self._clocks):
-            set_time(self._message.clock, now)
+        if self.publisher is None or now == self._announced:
+            return
+        if self.publisher.get_subscription_count() > len(self._clocks):
+            self.publish()
+
+    def announce(self) -> None:
+        """Publish the present time, before the clocks of the nodes are set to it."""
+        self._shown = self._announced = self.now
+        self.publish()
+
+    def publish(self) -> None:
+        """Publish the time that was set last, once more."""
+        if self.enabled and self.publisher is not None:
+            self.publications += 1
+            set_time(self._message.clock, self._shown)
             self.publisher.publish(self._message)
 
     def shift(self, duration: int) -> int:

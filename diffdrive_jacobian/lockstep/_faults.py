@@ -13,6 +13,7 @@ from diffdrive_jacobian.lockstep._fault_log import MAX_REPORTED, FaultEvent, Fau
 from diffdrive_jacobian.lockstep._injection import Fault, Injection, World
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep.external.others import Isolated
 from diffdrive_jacobian.messages.topics import FAULT_EVENTS
 from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds
 
@@ -20,16 +21,20 @@ from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds
 class Faults:
     """All faults of a world."""
 
-    def __init__(self, scheduler: Scheduler, nodes: Nodes, settle: Callable[[], None]) -> None:
+    def __init__(
+        self, scheduler: Scheduler, nodes: Nodes, others: Isolated, settle: Callable[[], None]
+    ) -> None:
         """Start without faults.
 
         Args:
             scheduler: Executes the nodes.
             nodes: The nodes of the world.
+            others: Nodes in other processes.
             settle: Executes all callbacks that are due.
         """
         self._scheduler = scheduler
         self._nodes = nodes
+        self._others = others
         self._settle = settle
         self._log = FaultLog(lambda: (scheduler.agenda.now, scheduler.clocks.now))
         self._world = World(
@@ -68,6 +73,7 @@ class Faults:
         same = sum(injection.fault == fault for injection in self._injections)
         injection = Injection(self._world, fault, len(self._injections), same, seed)
         fault.install(injection)
+        self._check_receivers(injection)
         self._injections.append(injection)
         injection.schedule()
         self._scheduler.links.filter(injection.stage_of)
@@ -76,6 +82,18 @@ class Faults:
         """Check which faults have met what they affect."""
         for injection in self._injections:
             injection.look()
+
+    def check_receivers(self) -> None:
+        """Check that no fault affects what nodes in other processes receive."""
+        for injection in self._injections:
+            self._check_receivers(injection)
+
+    def _check_receivers(self, injection: Injection) -> None:
+        if others := injection.receivers(self._others.subscribed_nodes):
+            raise LockstepError(
+                f'{injection.fault!r} cannot affect {", ".join(sorted(others))}: messages to other '
+                'processes are not intercepted; give node= with the name of a node of this world'
+            )
 
     def check(self) -> None:
         """Check that every fault met something that it could affect.

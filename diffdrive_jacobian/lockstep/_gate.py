@@ -14,9 +14,6 @@ from rclpy.timer import Timer
 
 from diffdrive_jacobian.lockstep._clock import Agenda
 
-FREE = object()
-"""Result of a callback that has done nothing, and therefore takes no time."""
-
 
 class Waiting(NamedTuple):
     """A callback that waits at a gate."""
@@ -136,16 +133,13 @@ class Gate:
         if not duration:
             return work()
         self._gates.running = self
-        result = None
         try:
-            result = work()
-            return result
+            return work()
         finally:
             self._gates.running = None
-            if result is not FREE:
-                self._busy = True
-                self._agenda.at(self._agenda.now + duration, partial(self._finish, self._life))
-                self._change()
+            self._busy = True
+            self._agenda.at(self._agenda.now + duration, partial(self._finish, self._life))
+            self._change()
 
     def serve_next(self) -> None:
         """Execute the oldest callback that waits."""

@@ -75,11 +75,6 @@ class Guard:
         self.raised = None
         self._since = time.monotonic()
 
-    def extend(self, seconds: float) -> None:
-        """Leave out a duration (s) for which another process was waited for."""
-        if self._since is not None:
-            self._since += seconds
-
     def disarm(self) -> None:
         """Stop the measurement."""
         self._since = None

@@ -313,6 +313,18 @@ class Injection:
             node.get_fully_qualified_name() == owner or (not owner and node not in self.world.observers)
         )
 
+    def receivers(self, names: Callable[[str], set[str]]) -> set[str]:
+        """Return the names of the nodes whose subscriptions the fault affects.
+
+        Args:
+            names: Returns the names of the subscribed nodes of a topic.
+        """
+        filtered = self._filtered
+        if filtered is None or filtered.at_publisher:
+            return set()
+        found = names(filtered.topic)
+        return found & {filtered.owner} if filtered.owner else found
+
     def stage_of(self, end: Source | Link) -> Stage | None:
         """Return the stage of the fault at one end of a link; None: it does not affect it."""
         filtered = self._filtered

@@ -29,7 +29,10 @@ Stage: TypeAlias = Callable[[bytes], Iterable[tuple[int, bytes]]]
 Taken: TypeAlias = tuple[Any, dict[str, Any]]
 """A message, or its bytes, and its info."""
 Published: TypeAlias = Callable[[Any, Any], None]
-"""Receives a publisher and the message or bytes that it has published."""
+"""Receives a publisher and the message or bytes that it has published.
+
+For messages from other processes an `ExternalTopic` takes the place of the publisher.
+"""
 Delivered: TypeAlias = Callable[[Node, Any, Any], None]
 """Receives the node of a subscription, the type of its messages, and a message or its bytes."""
 
@@ -66,7 +69,7 @@ def pass_on(
 
 
 class Source:
-    """What one publisher of a node publishes."""
+    """What one sender publishes on a topic: a publisher of a node, or other processes."""
 
     __slots__ = (
         'at',
@@ -97,7 +100,7 @@ class Source:
         self.links = links
         self.observers = observers
         self.owner: Node | None = None
-        """The node of the publisher. None: it was not added yet."""
+        """The node of the publisher. None: it was not added yet, or is in another process."""
         self.stages: list[Stage] = []
         self.count = self.at = self.order = 0
         """Number of messages, time of the last one by the clock of the nodes (ns), and its number among
@@ -198,6 +201,14 @@ class Link:
             return False
         self.arrive(taken)
         return True
+
+    def accept(self) -> None:
+        """Take exactly one message from the queue, and let it pass the stages."""
+        if not self.stages:
+            self.deliver()
+        elif (taken := self._take_next(self.message_type, True)) is not None:
+            late = partial(self._pass_late, taken[1])
+            pass_on(self.stages, taken[0], self._agenda, late, late)
 
     def arrive(self, taken: Taken) -> None:
         """Let a message pass the gate of the receiver, at once or later."""

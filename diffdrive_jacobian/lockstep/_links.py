@@ -14,11 +14,12 @@ from __future__ import annotations
 import inspect
 import threading
 from collections import deque
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container, Iterable, Sequence
 from functools import partial
 from itertools import count
 from typing import Any, NamedTuple
 
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
@@ -62,6 +63,8 @@ class Links:
         self._agenda, self._gates, self._clocks = agenda, gates, clocks
         self.pending: deque[Link | None] = deque()
         """One entry for each message and link. None: a request or a response of a service."""
+        self.held: set[str] = set()
+        """Topics whose messages are not polled: they come from other processes, see `external`."""
         self.thread = threading.get_ident()
         """The thread of the nodes."""
         self.elsewhere: dict[Any, SentElsewhere] = {}
@@ -69,6 +72,7 @@ class Links:
         self.unaffected: set[Publisher] = set()
         """Publishers of the world itself, whose messages no fault affects."""
         self._sources: dict[Publisher, Source] = {}
+        self._external: dict[str, Source] = {}
         self._links: dict[Subscription, Link] = {}
         self._by_topic: dict[str, list[Link]] = {}
         self._published: dict[str, list[Published]] = {}
@@ -92,14 +96,9 @@ class Links:
         """Return the functions that are called before each message of a topic is received."""
         return self._delivered.setdefault(topic, [])
 
-    def filter(self, stage_of: Filter, *, first: bool = False) -> None:
-        """Add the stages of a fault to all links that it affects, now and later.
-
-        Args:
-            stage_of: Returns the stage.
-            first: Whether it is the first stage of later links.
-        """
-        self._filters.insert(0 if first else len(self._filters), stage_of)
+    def filter(self, stage_of: Filter) -> None:
+        """Add the stages of a fault to all links that it affects, now and later."""
+        self._filters.append(stage_of)
         for link in self._links.values():
             if (stage := stage_of(link)) is not None:
                 link.add_stage(stage)
@@ -190,6 +189,26 @@ class Links:
         finally:
             self._sending = False
 
+    def note_external(self, source: Any, messages: Sequence[bytes]) -> None:
+        """Count messages from other processes on a topic.
+
+        Args:
+            source: The topic, which takes the place of a publisher: it has its `topic_name` and
+                `msg_type`.
+            messages: The messages, serialized.
+        """
+        name = source.topic_name
+        if name not in self._external:
+            self._external[name] = self._source(name, source.msg_type)
+        record = self._external[name]
+        for message in messages:
+            record.count += 1
+            record.order = next(self._numbers)
+            record.at = self._clocks.now
+            record.message = message
+            for observer in record.observers:
+                observer(source, message)
+
     # --- Receiving
 
     def update(self, members: Iterable[Member], without: Container[Subscription] = ()) -> list[Link]:
@@ -268,6 +287,8 @@ class Links:
         """
         found = False
         for link in self._polled:
+            if self.held and link.topic in self.held:
+                continue
             # As `deliver`, without a call for each.
             taken = link.take(link.message_type, link.raw)
             if taken is not None:
@@ -282,11 +303,35 @@ class Links:
 
     # --- What has happened
 
-    def sources(self) -> list[tuple[Publisher, Source]]:
-        """Return all sources with messages, with their publishers."""
-        return [pair for pair in self._sources.items() if pair[1].count]
+    def sources(self) -> list[tuple[Publisher | None, Source]]:
+        """Return all sources with messages, with their publishers. None: other processes."""
+        external = [(None, source) for source in self._external.values()]
+        return [pair for pair in (*self._sources.items(), *external) if pair[1].count]
 
     def last(self, topic: str) -> Any:
         """Return the last message of a topic as it was received; None: there is none."""
         sources = [source for _, source in self.sources() if source.topic == topic]
         return max(sources, key=lambda source: source.order).received() if sources else None
+
+    def count(self, topic: str) -> int:
+        """Return the number of messages that the nodes of the world have published on a topic."""
+        return sum(source.count for source in self._sources.values() if source.topic == topic)
+
+    def sent_to_others(self) -> int:
+        """Return the number of messages of the publishers that have a subscription elsewhere.
+
+        It changes with every message to another process.
+        """
+        return sum(
+            source.count
+            for publisher, source in self._sources.items()
+            if source.topic not in NOT_OF_ROBOTS and _subscriptions(publisher) > len(source.links)
+        )
+
+
+def _subscriptions(publisher: Publisher) -> int:
+    """Return the number of matched subscriptions of a publisher; 0 if it was destroyed."""
+    try:
+        return int(publisher.get_subscription_count())
+    except InvalidHandle:
+        return 0

@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.duration import Infinite
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from diffdrive_jacobian.diagnosis.graph import Quality, mismatch
 from diffdrive_jacobian.lockstep._errors import LockstepError, described
 from diffdrive_jacobian.lockstep._link import is_latched
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime
+from diffdrive_jacobian.lockstep.external.graph import compatible, qos_name
+from diffdrive_jacobian.lockstep.external.others import Isolated
 from diffdrive_jacobian.messages.names import node_of, type_name
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
-from diffdrive_jacobian.time_units import NANOSECONDS
 
 LISTENING_DEPTH = 1000
 """Queue size of `listen`: the number of messages of a topic at one simulated time."""
@@ -61,7 +60,12 @@ class Messaging:
             self._publishers[key] = self._with_type(topic, create, type(message), topic, profile)
         publisher = self._publishers[key]
         self._time.settle_unless_busy()
+        self._time.connect()
         subscriptions = publisher.get_subscription_count()
+        if subscriptions == 0 and not latched and not self._time.busy:
+            self._time.others.await_subscription(publisher)
+            self._time.connect()
+            subscriptions = publisher.get_subscription_count()
         # Both: a node that was not added may have come in place of one that was removed.
         counts = subscriptions, len(self._scheduler.links.to(publisher.topic_name))
         if counts != self._all_served.get(publisher) or subscriptions == 0:
@@ -86,13 +90,13 @@ class Messaging:
         offered = publisher.qos_profile
         for info in self._node.get_subscriptions_info_by_topic(given):
             requested = info.qos_profile
-            if info.topic_type == type_name(publisher.msg_type) and not _compatible(offered, requested):
+            if info.topic_type == type_name(publisher.msg_type) and not compatible(offered, requested):
                 volatile = offered.durability != DurabilityPolicy.TRANSIENT_LOCAL
                 hint = ': publish(..., latched=True)' if volatile and is_latched(info) else ''
                 raise LockstepError(
                     f'{publisher.topic_name} is subscribed to by {node_of(info)} with the quality of '
-                    f'service {_qos_name(requested)}, and published with {_qos_name(offered)}, which '
-                    f'does not reach it{hint}\n{self._report()}'
+                    f'service {qos_name(requested)}, and published with {qos_name(offered)}, which does '
+                    f'not reach it{hint}\n{self._report()}'
                 )
 
     def _check_all_served(self, topic: str) -> None:
@@ -146,6 +150,9 @@ class Messaging:
     def call(self, service_type: Any, name: str, request: Any, timeout: float) -> Any:
         """Call a service, as `Lockstep.call`."""
         name = self._node.resolve_service_name(name)
+        self._time.connect()
+        others = Isolated() if self._is_served(name) else self._time.others
+        others.await_service(name)
         services = dict(self._node.get_service_names_and_types())
         wanted = type_name(service_type)
         if wanted not in services.get(name, []):
@@ -157,11 +164,21 @@ class Messaging:
             )
         client = self._node.create_client(service_type, name)
         try:
+            others.until(client.service_is_ready, timeout, lambda: f'{name} is not ready')
             future = client.call_async(request or service_type.Request())
+            others.until(future.done, timeout, lambda: f'no response of {name}')
             self._time.run_until(future.done, timeout, f'a response of {name}')
             return future.result()
         finally:
             self._node.destroy_client(client)
+
+    def _is_served(self, service: str) -> bool:
+        """Return whether a node of the world provides a service."""
+        return any(
+            node.resolve_service_name(server.srv_name) == service
+            for node in self._scheduler.nodes
+            for server in node.services
+        )
 
     def _with_type(self, topic: str, create: Callable[..., Any], *args: Any) -> Any:
         try:
@@ -183,24 +200,3 @@ def _is_message(value: Any) -> bool:
 def _is_of_rclpy(types: list[str]) -> bool:
     """Return whether a service is one that rclpy provides for every node."""
     return types[0].startswith(SERVICES_OF_RCLPY)
-
-
-def _compatible(offered: QoSProfile, requested: QoSProfile) -> bool:
-    """Return whether a publisher and a subscription with these profiles are matched."""
-    return not mismatch(Quality.of(offered), Quality.of(requested))
-
-
-def _qos_name(profile: QoSProfile) -> str:
-    """Return what decides whether a profile is compatible, in words."""
-    latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    words = [profile.reliability.name.lower(), 'transient local' if latched else 'volatile']
-    if profile.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC:
-        words.append('liveliness manual by topic')
-    for name, limit in (
-        ('lease', profile.liveliness_lease_duration),
-        ('deadline', profile.deadline),
-    ):
-        # 0 and infinite: there is none.
-        if 0 < limit.nanoseconds < Infinite.nanoseconds:
-            words.append(f'{name} {limit.nanoseconds / NANOSECONDS:g} s')
-    return ', '.join(words)

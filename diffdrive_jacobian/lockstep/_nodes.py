@@ -57,10 +57,7 @@ class Nodes:
             raise LockstepError(f'node {name} was already added')
         self._scheduler.forget_destroyed()
         if any(other.get_fully_qualified_name() == name for other in self._scheduler.nodes):
-            raise LockstepError(
-                f'another node has the name {name}: give one of them a namespace, such as by '
-                "'--ros-args', '-r', '__ns:=/other'"
-            )
+            raise LockstepError(f'another node has the name {name}: give one of them a namespace')
         if node.context is not self.own.context:
             raise LockstepError(
                 f'node {name} is in another context: create it without context=, after Lockstep()'
@@ -75,10 +72,6 @@ class Nodes:
         """Note the function that has created a node."""
         self._factories[node.get_fully_qualified_name()] = factory
 
-    def forget(self, name: str) -> None:
-        """Forget the function that has created the node of a name."""
-        self._factories.pop(name, None)
-
     def restartable(self, name: str) -> bool:
         """Return whether the node of a name can be created again."""
         return name in self._factories
@@ -86,9 +79,8 @@ class Nodes:
     def restart(self, name: str) -> None:
         """Create the node of a name again."""
         node = self._factories[name]()
-        if node not in self._scheduler.nodes:
-            self.check_new(node)
-            self._scheduler.add(node)
+        self.check_new(node)
+        self._scheduler.add(node)
         if not self._scheduler.clocks.pauses:
             self._scheduler.clocks.set()
 

@@ -15,6 +15,7 @@ from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep._link import Delivered, Published
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep.external.others import Isolated
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -58,16 +59,20 @@ class Properties:
     advance time or publish. They change nothing that a node can notice.
     """
 
-    def __init__(self, scheduler: Scheduler, nodes: Nodes, report: Callable[[], str]) -> None:
+    def __init__(
+        self, scheduler: Scheduler, nodes: Nodes, others: Isolated, report: Callable[[], str]
+    ) -> None:
         """Start without properties.
 
         Args:
             scheduler: Executes the nodes.
             nodes: The nodes of the world.
+            others: Nodes in other processes.
             report: Returns the last messages of all topics as text.
         """
         self._scheduler = scheduler
         self._nodes = nodes
+        self._others = others
         self._report = report
         self.required: list[_Required] = []
         """What is required now."""
@@ -110,6 +115,7 @@ class Properties:
         required, self.required = self.required, []
         expected, self._expected = self._expected, []
         left = {id(one.property) for one in required}
+        self._offered.update(self._others.topics())
         for of, names in expected:
             # One that was violated has observed something, or its absence.
             if id(of) in left and self._offered.isdisjoint(names):

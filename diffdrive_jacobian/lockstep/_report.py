@@ -21,7 +21,6 @@ from diffdrive_jacobian.messages.structure import (
     walk,
 )
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
-from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 if TYPE_CHECKING:
@@ -29,14 +28,12 @@ if TYPE_CHECKING:
 
 MAX_SHOWN = 4
 """Number of elements that are shown of an array."""
-MAX_TEXT = 80
-"""Most characters of a text field that are shown."""
 MAX_CHECKED = 100
 """Length up to which arrays of zeros are omitted. Longer ones are not searched."""
 
 
 def describe(
-    sources: Values[tuple[Publisher, Source]],
+    sources: Values[tuple[Publisher | None, Source]],
     nodes: Values[Node],
     existing: Values[Node],
     now: int,
@@ -45,19 +42,20 @@ def describe(
     """Return the last message of each publisher, and the subscribed topics without messages, as text.
 
     Args:
-        sources: What was published, each with its publisher.
+        sources: What was published, each with its publisher. None: by other processes.
         nodes: The nodes of the world.
         existing: These, and those that were created but not added.
         now: Simulated time (ns).
         world_time: Time since the start (ns).
     """
-    names = {
+    names: dict[Publisher | None, str] = {
         publisher: node.get_fully_qualified_name() for node in existing for publisher in node.publishers
     }
+    names[None] = 'other processes'
     published = [
         (source.topic, names.get(publisher, 'a destroyed publisher'), source)
         for publisher, source in sources
-        if source.topic not in NOT_OF_ROBOTS
+        if source.topic not in NOT_OF_ROBOTS or publisher is None
     ]
     lines = [
         f'  {topic}: {source.count} from {node}, last at {source.at / NANOSECONDS:g} s: '
@@ -111,7 +109,7 @@ def _shown(kind: FieldType, value: Any) -> str:
             zero = len(value) <= MAX_CHECKED and all(_is_zero(one) for one in value)
             return '' if zero else _array(element, value)
         case Text():
-            return printable(repr(value), MAX_TEXT) if value else ''
+            return repr(value) if value else ''
         case _:
             return '' if _is_zero(value) else _scalar(kind, value)
 

@@ -19,6 +19,7 @@ from rclpy.duration import Duration
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from diffdrive_jacobian.lockstep._clock import Agenda, Clocks, Timers, is_due
@@ -64,6 +65,10 @@ class Scheduler:
         self._changed = False
         self._has_actions = False
         self._has_events = False
+        self.isolated = True
+        """Whether there are no messages from other processes."""
+        self.unserved: set[Subscription] = set()
+        """Subscriptions whose messages are not taken."""
         self.killed: set[Node] = set()
         """The nodes that were removed without being stopped."""
         self.agenda = Agenda()
@@ -217,7 +222,9 @@ class Scheduler:
 
     def _has_work(self) -> bool:
         """Return whether anything waits to be executed, or may wait without having been noticed."""
-        return bool(self.links.pending or self._changed or self.tasks or self._has_actions)
+        return bool(
+            self.links.pending or self._changed or self.tasks or self._has_actions or not self.isolated
+        )
 
     def _sooner(self, until_next: int | None) -> int | None:
         """Return the time until the next timer or action (ns); None: there is none."""
@@ -256,7 +263,7 @@ class Scheduler:
             after_callback: Whether nothing but a callback was executed since the last call. What it has
                 sent is known.
         """
-        events = not after_callback or self._has_events
+        events = not after_callback or self._has_events or not self.isolated
         while True:
             self._drain(events)
             if self._register_changed():
@@ -264,6 +271,11 @@ class Scheduler:
                 events = True
             elif not (self.tasks and self.tasks.run()):
                 return
+
+    def serve(self) -> None:
+        """Process requests and responses. Messages wait."""
+        self._handle_events()
+        self._register_changed()
 
     def _drain(self, events: bool = True) -> None:
         """Process messages and events until none is left.
@@ -393,7 +405,8 @@ class Scheduler:
         self._events.wake()
         # The registration itself does not count as an event.
         self._handle_events()
-        new = self.links.update(self._members.values(), self.clocks.find(self._members))
+        without = self.clocks.find(self._members) | self.unserved
+        new = self.links.update(self._members.values(), without)
         # Messages that a subscription has received before.
         for link in sorted(new, key=lambda link: link.latched):
             self.links.admit(link)

@@ -17,11 +17,14 @@ from diffdrive_jacobian.lockstep._clock import MAX_SECONDS
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep.external.others import Isolated
 from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 SHUT_DOWN = 'rclpy was shut down: only lockstep may do that'
+CONNECTION = 30.0
+"""Longest wall time for the discovery of external nodes (s)."""
 
 
 class SimulatedTime:
@@ -33,6 +36,7 @@ class SimulatedTime:
         guard: Guard,
         *,
         check_open: Callable[[], None],
+        discovered: Callable[[], None],
         report: Callable[[], str],
     ) -> None:
         """Start where the clocks are.
@@ -41,16 +45,17 @@ class SimulatedTime:
             scheduler: Executes the nodes.
             guard: Notices callbacks that block.
             check_open: Raises an error if time cannot advance any more.
+            discovered: Called when topics of other processes may have been discovered.
             report: Returns the last messages of all topics as text.
         """
         self._scheduler = scheduler
         self._clocks, self._agenda = scheduler.clocks, scheduler.agenda
         self._guard = guard
         self._check_open = check_open
-        self._report = report
+        self._discovered, self._report = discovered, report
         self._until_next: int | None = None
-        self.check_processes: Callable[[], None] = lambda: None
-        """Called when all callbacks of a time have been executed, before `check`."""
+        self.others = Isolated()
+        """Nodes in other processes."""
         self.check: Callable[[], None] = lambda: None
         """Called at each simulated time, when all callbacks have been executed."""
         self.busy = False
@@ -62,7 +67,7 @@ class SimulatedTime:
         self._check_open()
         with self.watched():
             self._until_next = self._scheduler.settle()
-        self.check_processes()
+        self._await_others()
         self.check()
 
     def settle_unless_busy(self) -> None:
@@ -76,11 +81,13 @@ class SimulatedTime:
         self._check_open()
         with self.watched():
             self._until_next = self._scheduler.catch_up()
+        self._await_others()
 
     def step(self, at_most: float | None) -> None:
         """Advance to the time at which the next timer expires, as `Lockstep.step`."""
         __tracebackhide__ = True
         end = math.inf if at_most is None else self._agenda.now + checked_nanoseconds('at_most', at_most)
+        self.connect()
         self._catch_up()
         if self._until_next is None and at_most is None:
             raise LockstepError('no timer is running, so step needs at_most')
@@ -90,6 +97,7 @@ class SimulatedTime:
         """Advance by a duration (s), as `Lockstep.run_for`."""
         __tracebackhide__ = True
         end = self._agenda.now + checked_nanoseconds('seconds', seconds)
+        self.connect()
         self.settle()
         while self._agenda.now < end:
             self._advance(end)
@@ -98,6 +106,7 @@ class SimulatedTime:
         """Advance until a condition is true, as `Lockstep.run_until`."""
         __tracebackhide__ = True
         end = self._agenda.now + checked_nanoseconds('timeout', timeout)
+        self.connect()
         self.settle()
         while not condition():
             if self._agenda.now >= end:
@@ -122,6 +131,7 @@ class SimulatedTime:
                 f'seconds must lead to a time after 0, at most {MAX_SECONDS} s, '
                 f'got {seconds!r} at {before:g} s'
             )
+        self.connect()
         self.settle()
         self._clocks.now = now
         self.arrive()
@@ -129,6 +139,7 @@ class SimulatedTime:
     def _advance(self, end: float) -> None:
         """Advance to the next timer or action, but not beyond an end of world time (ns)."""
         __tracebackhide__ = True
+        self.connect()
         until_next = math.inf if self._until_next is None else self._until_next
         # The minimum of integers is exact, also beside infinity.
         passed = int(min(until_next, end - self._agenda.now))
@@ -140,10 +151,43 @@ class SimulatedTime:
     def arrive(self) -> None:
         """Set the clocks of the nodes to the present time, and execute what is due then."""
         __tracebackhide__ = True
+        if self.others.announce():
+            with self.watched():
+                self._clocks.set()
+                self.others.release()
         with self.watched():
             self._until_next = self._scheduler.advance()
-        self.check_processes()
+        self._await_others()
         self.check()
+
+    # --- Nodes in other processes
+
+    def _await_others(self) -> None:
+        """Wait for the messages from other processes that are due, and execute what they cause."""
+        others = self.others
+        while others.await_answers():
+            with self.watched():
+                others.release()
+                self._until_next = self._scheduler.settle()
+        until_next = others.until_next()
+        if until_next is not None:
+            self._until_next = min(until_next, self._until_next or until_next)
+
+    def connect(self, timeout: float = CONNECTION) -> None:
+        """Wait until other processes are discovered, as `Lockstep.connect`."""
+        self._check_open()
+        others = self.others
+        if self.busy or others.connected():
+            return
+        self.settle()
+        while not others.connected():
+            others.connect(timeout)
+            # Recorders subscribe to topics that were discovered.
+            self._discovered()
+            self.settle()
+        with self.watched():
+            others.begin()
+        self.settle()
 
     # --- Execution
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, ClassVar, TypeVar
 
@@ -31,18 +31,18 @@ from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._properties import Properties, Property
 from diffdrive_jacobian.lockstep._report import describe
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
-from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, checked_nanoseconds
-from diffdrive_jacobian.lockstep.external.node_process import Command, NodeProcess
-from diffdrive_jacobian.lockstep.external.process import end_all
-from diffdrive_jacobian.lockstep.external.quiet import check_platform
-from diffdrive_jacobian.ros.fastdds_profiles import open_to_others, withdraw
+from diffdrive_jacobian.lockstep._simulated_time import CONNECTION, SimulatedTime, checked_nanoseconds
+from diffdrive_jacobian.lockstep.external.expectations import Expectation
+from diffdrive_jacobian.lockstep.external.others import External, Isolated, variables
+from diffdrive_jacobian.lockstep.external.process import ExternalProcess
+from diffdrive_jacobian.ros.fastdds_profiles import withdraw
 from diffdrive_jacobian.ros.rclpy_internals import refuse_init
-from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
+from diffdrive_jacobian.ros.runner import DISCOVERY, UserError, environment, ros_context
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 ISOLATED = ('--ros-args', '-p', 'start_type_description_service:=false')
-"""ROS arguments before those of the user: only tools in other processes call that service, and it takes
-time to create."""
+"""ROS arguments of a world without external nodes, before those of the user: only tools in other
+processes call that service, and it takes time to create."""
 N = TypeVar('N', bound=Node)
 
 
@@ -50,7 +50,7 @@ class Lockstep:
     """Executes nodes in the default context of rclpy, in simulated time.
 
     Nodes are created as usual, after the `Lockstep`, and added to it. `use_sim_time` is true for all of
-    them. They are isolated: no other process receives their messages but those that `start` starts.
+    them. They are isolated: no other process receives their messages. Without external nodes
     `start_type_description_service` is false, unless `args` say otherwise.
 
         with Lockstep() as world:
@@ -71,6 +71,8 @@ class Lockstep:
         *,
         start: float = 1.0,
         patience: float = 10.0,
+        external: Iterable[Expectation] | None = None,
+        domain_id: int | None = None,
     ) -> None:
         """Initialize rclpy and start without nodes.
 
@@ -79,11 +81,16 @@ class Lockstep:
             start: Simulated time at the start (s).
             patience: Longest wall time for one simulated time (s). Beyond it an error names the
                 callbacks.
+            external: What nodes in other processes on this machine send (`Answers`, `Every`, `Idle`).
+                Time does not advance before it has been received. None: no other process is discovered.
+            domain_id: The ROS domain in which they are; None: one that is not in use, see `domain_id`.
+                Only with `external`.
 
         Raises:
             LockstepError: rclpy is already initialized, for example by another `Lockstep`, the arguments
                 are invalid, or this is not the main thread.
-            ValueError: `start` or `patience` is not positive, or too long.
+            ValueError: `start` or `patience` is not positive, or too long, or `external` or `domain_id`
+                is invalid.
         """
         begin = checked_nanoseconds('start', start)
         checked_nanoseconds('patience', patience)
@@ -97,24 +104,30 @@ class Lockstep:
         self._start = begin
         self._closing = ExitStack()
         try:
-            self._compose(args, patience)
+            self._compose(args, patience, external, variables(external, domain_id))
         except BaseException:
-            withdraw()
             Lockstep._open = None
             self._closing.close()
             raise
 
-    def _compose(self, args: Sequence[str], patience: float) -> None:
+    def _compose(
+        self,
+        args: Sequence[str],
+        patience: float,
+        external: Iterable[Expectation] | None,
+        environment_of_others: dict[str, str],
+    ) -> None:
         """Create the parts of the world."""
-        arguments = ['lockstep', *ISOLATED, *args, '--ros-args', '-p', 'use_sim_time:=true']
-        # For the processes that may be started: read with the first participant of this one.
-        open_to_others()
+        defaults = ISOLATED if external is None else ()
+        arguments = ['lockstep', *defaults, *args, '--ros-args', '-p', 'use_sim_time:=true']
+        isolated = {**dict.fromkeys(DISCOVERY), DISCOVERY[0]: 'OFF'}
         try:
-            with discovery_off():
+            with environment({**isolated, **environment_of_others}):
                 context = self._closing.enter_context(ros_context(arguments, default=True))
         except UserError as error:
             raise LockstepError(str(error)) from error
         refuse_init(context, _refuse_init)
+        withdraw()
         self._scheduler = scheduler = Scheduler(context, self._start)
         self._closing.callback(self._destroy_nodes)
         self._closing.callback(scheduler.links.close)
@@ -124,23 +137,26 @@ class Lockstep:
             raise LockstepError('Lockstep must be created and used in the main thread') from error
         self._closing.callback(guard.close)
         self._nodes = Nodes(scheduler)
-        # With its first node the context gets its participant.
-        withdraw()
         self.node = self._nodes.own
         """Node for the publishers, subscriptions and clients of a test."""
         self._time = SimulatedTime(
             scheduler,
             guard,
             check_open=self._check_open,
+            discovered=self._on_discovery,
             report=self.report,
         )
-        self._processes: list[NodeProcess] = []
-        self._closing.callback(self._close_processes)
-        self._time.check_processes = self._check_processes
-        self._extend = guard.extend
+        others: Isolated = Isolated()
+        if external is not None:
+            others = External(
+                self.node, scheduler, self._time.watched, self.report, environment_of_others
+            )
+            self._closing.callback(others.close)
+            others.declare(external)
+        self._time.others = self._others = others
         self._messaging = Messaging(scheduler, self._nodes, self._time, self.report)
-        self._faults = Faults(scheduler, self._nodes, self.settle)
-        self._properties = Properties(scheduler, self._nodes, self.report)
+        self._faults = Faults(scheduler, self._nodes, others, self.settle)
+        self._properties = Properties(scheduler, self._nodes, others, self.report)
         self._time.check = self._properties.check
         Lockstep._open = self
         self._time.arrive()
@@ -151,17 +167,9 @@ class Lockstep:
         """Return this object."""
         return self
 
-    def __exit__(self, kind: object, *_: object) -> None:
-        """Close it.
-
-        Raises:
-            LockstepError: A process that was started has lost messages, and there is no other error.
-        """
-        try:
-            if kind is None and self.is_open:
-                self._check_lost()
-        finally:
-            self.close()
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        self.close()
 
     @property
     def is_open(self) -> bool:
@@ -179,19 +187,6 @@ class Lockstep:
         self._scheduler.close()
         for node in nodes:
             node.destroy_node()
-
-    def _close_processes(self) -> None:
-        end_all([process.child for process in self._processes])
-        for process in self._processes:
-            process.close()
-
-    def _check_processes(self) -> None:
-        for process in self._processes:
-            process.check()
-
-    def _check_lost(self) -> None:
-        for process in self._processes:
-            process.check_lost(now=True)
 
     def _check_open(self) -> None:
         if Lockstep._open is not self:
@@ -411,7 +406,8 @@ class Lockstep:
             service_type: Type of the service.
             name: Name of the service.
             request: The request; None: an empty one.
-            timeout: Longest simulated time for the response (s).
+            timeout: Longest simulated time for the response (s); wall time if another process provides
+                the service.
 
         Raises:
             LockstepError: There is no such service, or it does not respond in time.
@@ -425,7 +421,7 @@ class Lockstep:
         text = describe(
             scheduler.links.sources(), scheduler.nodes, scheduler.existing, self.now, self.world_time
         )
-        text = '\n  '.join([text, *(process.describe() for process in self._processes)])
+        text = '\n  '.join([text, *self._others.describe()])
         return '\n'.join([text, *self._faults.describe()])
 
     # --- Faults
@@ -441,7 +437,8 @@ class Lockstep:
             seed: Seed of their random numbers.
 
         Raises:
-            LockstepError: An argument is no fault, or a fault is over already.
+            LockstepError: An argument is no fault, or a fault is over already, or affects what nodes in
+                other processes receive.
         """
         self._check_open()
         self._faults.inject(faults, seed)
@@ -496,7 +493,6 @@ class Lockstep:
         if self._properties:
             # Not otherwise: a test may have passed because a callback raises what it expects.
             self.settle()
-        self._check_lost()
         self._properties.finish()
         self.check_faults()
 
@@ -540,70 +536,74 @@ class Lockstep:
 
     # --- Nodes in other processes
 
+    @property
+    def domain_id(self) -> int:
+        """ROS domain of the external nodes.
+
+        Raises:
+            LockstepError: The world is isolated.
+        """
+        return int(self.environment['ROS_DOMAIN_ID'])
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Environment variables for a process that is to be discovered, besides those of this one.
+
+        Raises:
+            LockstepError: The world is isolated.
+        """
+        self._check_open()
+        return self._others.environment
+
     def start(
         self,
-        command: Sequence[str | os.PathLike[str]],
-        *,
+        *command: str | os.PathLike[str],
+        answers: Iterable[Expectation] = (),
         use_sim_time: bool = True,
         cwd: str | os.PathLike[str] | None = None,
         env: Mapping[str, str] | None = None,
-        clock_period: float = 0.01,
-        queue_depth: int = 10,
-        timeout: float = 30.0,
-        patience: float = 5.0,
-    ) -> NodeProcess:
-        """Start a process, whose nodes take part as if they had been added.
-
-        Only on Linux. A node of the world stands for each node of the process: `find` returns it. What
-        that receives is sent to the process, which is then waited for until it is quiet. If such a node
-        is removed or destroyed the process is ended, and a fault that kills it for a while starts the
-        process again. The process receives the time before each message, and every `clock_period`. When
-        the world is closed, it is ended with all that it has started.
+    ) -> ExternalProcess:
+        """Start a process in the ROS domain of this world. When the world is closed, it is ended
+        with all that it has started.
 
         Args:
-            command: The program and its arguments: `['ros2', 'run', 'my_package', 'my_node']`.
+            command: The program and its arguments: `'ros2', 'run', 'my_package', 'my_node'`.
+            answers: What is awaited from it, as for `external`, until the test ends it.
             use_sim_time: Whether to add `--ros-args -p use_sim_time:=true` to the command.
             cwd: Its working directory; None: that of this process.
             env: Further environment variables.
-            clock_period: Period at which it receives the time (s). Its timers expire at multiples of it.
-            queue_depth: Queue size of its subscriptions, which it does not tell.
-            timeout: Longest time until its nodes have been discovered (s).
-            patience: Longest time for a callback (s). For both, time during which it waited for a
-                processor does not count.
 
         Returns:
-            The process.
+            The process. It runs, but is not discovered yet: see `connect`.
 
         Raises:
-            LockstepError: It cannot be started, its nodes are not discovered in time, do not follow
-                simulated time, or have a type that is not installed for Python. Or this is not Linux.
-            ValueError: A duration is not positive, or too long.
+            LockstepError: The world is isolated, or the process cannot be started.
+            ValueError: `answers` is invalid.
         """
         self._check_open()
-        check_platform()
-        parameters = Command(
-            command=command,
-            use_sim_time=use_sim_time,
-            cwd=cwd,
-            env=env or {},
-            clock_period=clock_period,
-            queue_depth=queue_depth,
-            timeout=timeout,
-            patience=patience,
-        )
-        process = NodeProcess(
-            parameters, self._nodes, self._scheduler, self._extend, lambda: self.is_open
-        )
-        process.start()
-        self._processes.append(process)
-        process.join()
-        self._time.arrive()
-        return process
+        return self._others.start(command, answers, use_sim_time, cwd, env)
 
-    @property
-    def processes(self) -> list[NodeProcess]:
-        """The processes that were started."""
-        return list(self._processes)
+    def connect(self, timeout: float = CONNECTION) -> None:
+        """Wait until the external nodes are discovered, and have discovered the nodes of the world.
+
+        The methods that let time pass do so themselves, also after new nodes were added or started. Only
+        then do external nodes receive the time. In an isolated world there is nothing to wait for.
+
+        Args:
+            timeout: Longest wall time (s).
+
+        Raises:
+            ValueError: `timeout` is not positive.
+            LockstepError: Nodes are not discovered in time, or a process has ended.
+        """
+        __tracebackhide__ = True
+        checked_nanoseconds('timeout', timeout)
+        self._time.connect(timeout)
+
+    def _on_discovery(self) -> None:
+        """Note that topics may have been discovered."""
+        self._faults.check_receivers()
+        self._nodes.note_change()
 
 
 def _refuse_init(*_: Any, **__: Any) -> None:

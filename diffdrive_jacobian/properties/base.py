@@ -12,6 +12,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.faults.fault import Expression
+from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.numerics.fields import Name, Text
@@ -77,13 +78,30 @@ class Watch:
         return None
 
     def owner(self, publisher: Publisher) -> Node | None:
-        """Return the node that has a publisher; None: it was removed, or not added yet."""
+        """Return the node that has a publisher; None: it was removed, or not added yet.
+
+        Raises:
+            LockstepError: The message comes from another process.
+        """
         owner = self._owners.get(publisher)
         if owner is None:
+            self.check_observable(publisher)
             owner = self.world.node_of(publisher)
             if owner is not None:
                 self._owners[publisher] = owner
         return owner
+
+    def check_observable(self, publisher: Publisher) -> None:
+        """Check that a message comes from a node of this process, of which all can be observed.
+
+        Raises:
+            LockstepError: It comes from another process.
+        """
+        if not isinstance(publisher, Publisher):
+            raise LockstepError(
+                f'a property observes the node that publishes {publisher.topic_name}, which is in '
+                'another process: what that node receives is not known here'
+            )
 
     def name_of(self, node: Node) -> str:
         """Return the fully qualified name of a node, also after it was destroyed."""

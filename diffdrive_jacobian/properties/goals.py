@@ -325,6 +325,7 @@ class _DueGoalWatch(_GoalWatch[DueGoalProperty]):
             world.on_delivered(required.resolved(topic), self._on_goal)
         self._commands = world.node.resolve_topic_name(required.resolved(required.commands))
         world.expect(self._commands)
+        world.on_published(self._commands, lambda publisher, _: self.check_observable(publisher))
         world.on_published(required.resolved(required.status), self._on_status)
         world.on_response(required.resolved(required.cancel), self._on_cancel)
 

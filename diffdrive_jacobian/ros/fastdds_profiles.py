@@ -66,18 +66,6 @@ def open_to_others() -> None:
         _use('heartbeats')
 
 
-def for_other_process() -> dict[str, str]:
-    """Return the environment variables with which another process does what `open_to_others` does.
-
-    To be called when this process has a participant.
-    """
-    open_to_others()
-    try:
-        return {VARIABLE: os.environ[VARIABLE]} if _own() else {}
-    finally:
-        withdraw()
-
-
 def withdraw() -> None:
     """Remove the variable when the first participant exists: other processes must not inherit it."""
     if _own() is not None:

@@ -34,6 +34,8 @@ from rclpy.task import Task
 from rclpy.time import Time
 from rclpy.timer import Timer
 
+from diffdrive_jacobian.time_units import NANOSECONDS
+
 RCLError: type[Exception] = rclpy_implementation.RCLError
 """Error of rcl, for example that a name is invalid or an object was destroyed. A RuntimeError."""
 UnknownROSArgsError: type[Exception] = rclpy_implementation.UnknownROSArgsError
@@ -279,6 +281,24 @@ def message_taker(
     handle = subscription.handle
     handle.__enter__()
     return handle.take_message, lambda: handle.__exit__(None, None, None)
+
+
+def wait_for_message(context: Context, subscription: Subscription, timeout: float) -> bool:
+    """Wait until a subscription has a message. Return whether it has one.
+
+    Relies on the wait set of rclpy, which is not public, and on `Subscription.handle`.
+
+    Args:
+        context: The context of the subscription.
+        subscription: The subscription, which no executor waits for.
+        timeout: Longest wait (s).
+    """
+    with subscription.handle, context.handle:
+        wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, context.handle)
+        wait_set.clear_entities()
+        index = wait_set.add_subscription(subscription.handle)
+        wait_set.wait(round(timeout * NANOSECONDS))
+        return bool(wait_set.is_ready('subscription', index))
 
 
 def receives_info(subscription: Subscription) -> bool:
@@ -579,50 +599,3 @@ def new_task(function: Any, arguments: tuple[Any, ...], keywords: dict[str, Any]
     Relies on the constructor of `rclpy.task.Task`, which is meant for executors.
     """
     return Task(function, arguments, keywords, executor=executor)
-
-
-# --- Endpoints without an executor
-
-
-def raw_sender(publisher: Publisher) -> Callable[[bytes], None]:
-    """Return a function that publishes serialized messages, which nobody who wraps `publish` notices.
-
-    Relies on `Publisher.handle.publish_raw`.
-    """
-    send: Callable[[bytes], None] = publisher.handle.publish_raw
-    return send
-
-
-def take_request(service: Service) -> tuple[Any, Any] | None:
-    """Take a request and its id from the queue of a service that is in no executor.
-
-    Relies on `Service.handle.service_take_request`. None: there is none.
-    """
-    request, header = service.handle.service_take_request(service.srv_type.Request)
-    return None if header is None else (request, header.request_id)
-
-
-def send_response(service: Service, response: Any, request_id: Any) -> None:
-    """Send a response, which nobody who wraps `Service.send_response` notices.
-
-    Relies on `Service.handle.service_send_response`.
-    """
-    service.handle.service_send_response(response, request_id)
-
-
-def send_request(client: Client, request: Any) -> int:
-    """Send a request, which nobody who wraps `call_async` notices. Return its number.
-
-    Relies on `Client.handle.send_request`.
-    """
-    number: int = client.handle.send_request(request)
-    return number
-
-
-def take_response(client: Client) -> tuple[int, Any] | None:
-    """Take a response and the number of its request from the queue of a client that is in no executor.
-
-    Relies on `Client.handle.take_response`. None: there is none.
-    """
-    header, response = client.handle.take_response(client.srv_type.Response)
-    return None if header is None else (header.request_id.sequence_number, response)

@@ -3,8 +3,7 @@
 Names of this package, which are imported on first use:
 
 - `Lockstep` and its errors.
-- `NodeProcess`: a process whose nodes take part.
-- `check_repeats`: whether a world does the same each time.
+- `Answers`, `Every`, `Idle`: what nodes in other processes send.
 - `explore`, `fault_schedules`, `poses`, ...: exploring worlds, most of which needs Hypothesis.
 - `path_message`: the message with a path.
 - `RecordedRun`, `GoldenRun`: types of the fixtures `recorded_run` and `golden_run`.
@@ -43,28 +42,28 @@ if TYPE_CHECKING:
         LockstepError,
         PropertyViolation,
     )
-    from diffdrive_jacobian.lockstep.external.node_process import NodeProcess
+    from diffdrive_jacobian.lockstep.external.expectations import Answers, Every, Idle
     from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.nodes.goal_client import path_message
     from diffdrive_jacobian.testing.recorded_run import GoldenRun, RecordedRun
-    from diffdrive_jacobian.testing.repeats import check_repeats
 
 __all__ = [
+    'Answers',
+    'Every',
     'Exploration',
     'ExplorationError',
     'Finding',
     'GoldenRun',
+    'Idle',
     'IneffectiveFaultsError',
     'LocalExecutor',
     'Lockstep',
     'LockstepError',
-    'NodeProcess',
     'PropertyViolation',
     'RecordedRun',
     'Replay',
     'SerialExecutor',
     'angles',
-    'check_repeats',
     'explore',
     'fault_schedules',
     'gains',
@@ -90,11 +89,10 @@ _MODULES = {
         *('fault_schedules', 'waypoints'),
     ),
     'lockstep._errors': ('IneffectiveFaultsError', 'LockstepError', 'PropertyViolation'),
-    'lockstep.external.node_process': ('NodeProcess',),
+    'lockstep.external.expectations': ('Answers', 'Every', 'Idle'),
     'lockstep.world': ('Lockstep',),
     'nodes.goal_client': ('path_message',),
     'testing.recorded_run': ('GoldenRun', 'RecordedRun'),
-    'testing.repeats': ('check_repeats',),
 }
 
 if not TYPE_CHECKING:

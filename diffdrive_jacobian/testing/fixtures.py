@@ -105,7 +105,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Register the marker."""
     config.addinivalue_line(
         'markers',
-        'lockstep(args, start, patience): arguments of the Lockstep of this test',
+        'lockstep(args, start, patience, external, domain_id): arguments of the Lockstep of this test',
     )
     # The hook before is not called for a plugin that a conftest.py loads.
     _check_fields(config)

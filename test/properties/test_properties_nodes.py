@@ -6,10 +6,11 @@ from math import inf
 from types import SimpleNamespace
 
 import pytest
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry, Path
 from property_nodes import Scene, Student, goal_at, odometry_at, status, twist
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import (
     ABORTED,
@@ -407,6 +408,26 @@ def test_a_robot_that_stands_on_its_way(lockstep, robot_at):
     violation = violated(lockstep, 2.0)
     assert 3.5 < violation.seconds < 3.56
     assert violation.text.startswith('1.54 s after the faults have ended the robot has stood for 0.5')
+
+
+def test_what_another_process_receives_is_not_known(lockstep):
+    """Such properties must not seem to hold. Those of the messages alone are observed."""
+    source = type('Source', (), {'topic_name': '/cmd_vel', 'msg_type': Twist})()
+    message = serialize_message(twist(0.75))
+    for required in (
+        StopsAfterLostOdometry(1.0),
+        StopsOnShutdown(),
+        ArrivesOnceFaultsEnd(1.0),
+        KeepsDriving(1.0),
+    ):
+        lockstep.require(required)
+        with pytest.raises(LockstepError, match='/cmd_vel, which is in another process'):
+            lockstep._scheduler.links.note_external(source, [message])
+        lockstep._properties.required.pop().end()
+    lockstep.require(NeverFasterThan(0.5, 1.0))
+    lockstep._scheduler.links.note_external(source, [message])
+    with pytest.raises(PropertyViolation, match=r'v 0.75 m/s'):
+        lockstep.settle()
 
 
 @pytest.mark.parametrize(

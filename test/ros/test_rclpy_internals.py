@@ -21,7 +21,6 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.service import Service
@@ -475,32 +474,14 @@ def test_entities_of_a_node_are_counted(node):
     assert internals.longest_queue(node) == sys.maxsize
 
 
-def test_endpoints_without_an_executor(ros, monkeypatch):
-    """Nobody who wraps the methods of rclpy notices what they send."""
-
-    def refuse(*_):
-        raise AssertionError('it was noticed')
-
-    service = ros.peer.create_service(SetBool, 'switch', refuse)
-    client = ros.peer.create_client(SetBool, 'switch')
-    subscription = ros.peer.create_subscription(String, 'words', refuse, 10, raw=True)
-    publisher = ros.peer.create_publisher(String, 'words', 10)
-    ros.until(client.service_is_ready, 'the service')
-    for wrapped in ((Publisher, 'publish'), (Client, 'call_async'), (Service, 'send_response')):
-        monkeypatch.setattr(*wrapped, refuse)
-    data = serialize_message(String(data='spoken'))
-    internals.raw_sender(publisher)(data)
-    take, release = internals.message_taker(subscription)
-    assert take(String, True)[0] == data
-    release()
-    assert internals.take_request(service) is None
-    assert internals.take_response(client) is None
-    number = internals.send_request(client, SetBool.Request(data=True))
-    request, request_id = internals.take_request(service)
-    assert request.data is True
-    internals.send_response(service, SetBool.Response(message='on'), request_id)
-    taken, response = internals.take_response(client)
-    assert (taken, response.message) == (number, 'on')
+def test_a_message_is_waited_for_without_an_executor(ros):
+    publisher = ros.peer.create_publisher(String, 'topic', 10)
+    subscription = ros.peer.create_subscription(String, 'topic', lambda _: None, 10)
+    assert not internals.wait_for_message(ros.context, subscription, 0.0)
+    publisher.publish(String())
+    # It is not taken.
+    for _ in range(2):
+        assert internals.wait_for_message(ros.context, subscription, 10.0)
 
 
 def test_tasks_that_are_not_done_are_detected(single):

@@ -1,1 +1,1 @@
-"""Nodes in other processes."""
+"""Nodes in other processes: simulated time waits until they have sent what the test declares."""
