@@ -35,7 +35,7 @@ import importlib
 for name in {PACKAGES}:
     package = importlib.import_module(f'{PACKAGE}.{{name}}')
     for one in getattr(package, '__all__', []):
-        getattr(package, one)
+        exec(f'from {PACKAGE}.{{name}} import {{one}}')
 """
     subprocess.run([sys.executable, '-c', code], check=True)
 

@@ -12,6 +12,7 @@ from geometry_msgs.msg import Twist, Vector3
 from rclpy.node import Node
 
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.properties import NeverFasterThan
 
 PERIOD = 0.1
 TIMEOUT = None
@@ -28,6 +29,12 @@ def serial(scenario, properties=(), **arguments):
 
 def nothing(world, case):
     """Do nothing."""
+
+
+def demanding(world, case):
+    """Require a property of its own, which the robot breaks."""
+    world.require(NeverFasterThan(0.1, 1.0))
+    follow(world, {'speed': 1.0})
 
 
 def failing(world, case):

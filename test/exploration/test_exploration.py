@@ -11,7 +11,17 @@ from pathlib import Path
 
 import exploration_scenarios as scenarios
 import pytest
-from exploration_scenarios import changing, divide, failing, follow, identified, moving, nothing, serial
+from exploration_scenarios import (
+    changing,
+    demanding,
+    divide,
+    failing,
+    follow,
+    identified,
+    moving,
+    nothing,
+    serial,
+)
 from hypothesis import strategies as st
 from support import inner_sessions  # noqa: F401  What it imports is not imported again.
 
@@ -152,6 +162,12 @@ def test_each_property_and_each_exception_is_a_finding(tmp_path):
     assert crash.violation.text.startswith('Traceback')
     assert 'ZeroDivisionError' in str(crash)
     assert crash.deterministic
+
+
+def test_a_property_that_the_scenario_requires_is_a_finding():
+    (finding,) = serial(demanding, worlds=1).findings
+    assert finding.violation.key == repr(NeverFasterThan(0.1, 1.0))
+    assert finding.deterministic
 
 
 def test_a_scenario_that_is_not_deterministic_is_reported():

@@ -263,6 +263,18 @@ def test_a_controller_that_measures_by_the_time_of_day_does_not_stop_after_a_jum
     assert '/student' in violated(lockstep, 1.0).text
 
 
+def test_a_jump_while_a_robot_stands_counts_from_the_jump(lockstep, robot_at):
+    """A controller that begins to drive long after it is late at once."""
+    lockstep.require(StopsAfterLostOdometry(0.3))
+    robot_at()
+    student = lockstep.add(Student())
+    student.command = twist(0.0)
+    lockstep.inject(Loss('odom', start=1.0), TimeJump(1.0, start=1.1))
+    lockstep.run_for(2.0)
+    student.commands.publish(twist(0.2))
+    assert 2.0 <= violated(lockstep, 1.0).seconds < 2.03
+
+
 def test_stops_after_last_command(lockstep, robot_at):
     robot = robot_at(cmd_vel_timeout=0.5)
     lockstep.require(StopsAfterLastCommand(0.5))

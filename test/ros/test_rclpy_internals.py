@@ -521,7 +521,7 @@ def internals_in(path):
     own = set(re.findall(r'(?:def |class |self\.|^ +)(_[a-z]\w*)', text, re.MULTILINE))
     modules = set(re.findall(r'^\s*from (rclpy\.(?:impl|experimental)[\w.]*)', text, re.MULTILINE))
     body = re.sub(r'^\s*(from|import) .*|`[^`]*`', '', text, flags=re.MULTILINE)
-    used = set(re.findall(r'(?<!\bself)(?<!\bcls)\.(_[a-z]\w*)', body))
+    used = set(re.findall(r'(?<!\bself)(?<!\bcls)(?<!\bos)\.(_[a-z]\w*)', body))
     public = set(re.findall(r'\.(take_message|timer_period_ns = )', text))
     return used - own | modules | public
 
