@@ -49,8 +49,9 @@ class SimulatedTime:
         self._check_open = check_open
         self._report = report
         self._until_next: int | None = None
-        self.check_processes: Callable[[], None] = lambda: None
-        """Called when all callbacks of a time have been executed, before `check`."""
+        self.check_processes: Callable[[], bool] = lambda: False
+        """Called when all callbacks of a time have been executed, before `check`. Returns whether there
+        are others now."""
         self.check: Callable[[], None] = lambda: None
         """Called at each simulated time, when all callbacks have been executed."""
         self.busy = False
@@ -62,7 +63,7 @@ class SimulatedTime:
         self._check_open()
         with self.watched():
             self._until_next = self._scheduler.settle()
-        self.check_processes()
+        self._settle_processes()
         self.check()
 
     def settle_unless_busy(self) -> None:
@@ -76,6 +77,14 @@ class SimulatedTime:
         self._check_open()
         with self.watched():
             self._until_next = self._scheduler.catch_up()
+        self._settle_processes()
+
+    def _settle_processes(self) -> None:
+        """Check the other processes, and execute what that causes."""
+        __tracebackhide__ = True
+        while self.check_processes():
+            with self.watched():
+                self._until_next = self._scheduler.settle()
 
     def step(self, at_most: float | None) -> None:
         """Advance to the time at which the next timer expires, as `Lockstep.step`."""
@@ -142,7 +151,7 @@ class SimulatedTime:
         __tracebackhide__ = True
         with self.watched():
             self._until_next = self._scheduler.advance()
-        self.check_processes()
+        self._settle_processes()
         self.check()
 
     # --- Execution

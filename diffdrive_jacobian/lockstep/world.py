@@ -185,9 +185,9 @@ class Lockstep:
         for process in self._processes:
             process.close()
 
-    def _check_processes(self) -> None:
-        for process in self._processes:
-            process.check()
+    def _check_processes(self) -> bool:
+        # One at a time: what a process still sends may be for another one.
+        return any(process.check() for process in self._processes)
 
     def _check_lost(self) -> None:
         for process in self._processes:

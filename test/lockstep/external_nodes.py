@@ -233,7 +233,7 @@ class Asking(Controller):
 
     def on_odometry(self, odometry):
         future = self.client.call_async(Trigger.Request())
-        rclpy.spin_until_future_complete(self.helper, future, timeout_sec=2.0)
+        rclpy.spin_until_future_complete(self.helper, future, timeout_sec=0.4)
         self.send(float(future.result().message) if future.done() else -1.0)
 
 

@@ -759,10 +759,10 @@ class NodeProcess:
             lasting, self._lasting = self._lasting, []
             self._forward(lasting)
 
-    def _wait(self) -> None:
+    def _wait(self, asks: Callable[[], bool] | None = None) -> None:
         """Wait until the process and the threads that receive from it are quiet."""
         try:
-            self._quiet.wait(self._command.patience, self._asks)
+            self._quiet.wait(self._command.patience, asks or self._asks)
         except LockstepError as error:
             names = ', '.join(self._stand_ins) or self.child.title
             raise LockstepError(
@@ -777,8 +777,8 @@ class NodeProcess:
         if not self._quiet.waits_in_callback:
             raise LockstepError(
                 f'a callback of {", ".join(self._stand_ins)} waited for the response of a service until '
-                f'its timeout, which is wall time, at {self._clocks.now / NANOSECONDS:g} s: it comes '
-                'later in simulated time, or this machine is too slow\n' + self.describe()
+                f'its timeout, which is wall time, at {self._clocks.now / NANOSECONDS:g} s: this '
+                'machine is too slow\n' + self.describe()
             )
 
     def _asks(self) -> bool:
@@ -798,14 +798,32 @@ class NodeProcess:
         for one in arrived:
             one.forward()
 
-    def check(self) -> None:
-        """Check that it runs, lost nothing, and has sent nothing while nothing was delivered to it."""
-        if self._connected:
-            self.child.check_running(', '.join(self._stand_ins))
-            if self._quiet.waits_in_callback:
-                self._check_waits()
-            self._refuse(self._take())
-            self.check_lost()
+    def check(self) -> bool:
+        """Check that it runs, lost nothing, and has sent nothing while nothing was delivered to it.
+
+        Returns:
+            Whether it does something still: a callback waits for a response that does not come now.
+        """
+        if not self._connected:
+            return False
+        self.child.check_running(', '.join(self._stand_ins))
+        if self._quiet.waits_in_callback:
+            next(iter(self._stand_ins.values())).executor.create_task(self._end_waits)
+            return True
+        self._refuse(self._take())
+        self.check_lost()
+        return False
+
+    def _end_waits(self) -> None:
+        """Wait until callbacks that wait for responses have waited in vain, and go on."""
+        begin = time.monotonic()
+        self._wait(lambda: False)
+        self._extend(time.monotonic() - begin)
+        held, self._held = self._held, []
+        self._forward(self._take())
+        self.check_lost()
+        for send in held:
+            self._exchange(send)
 
     def check_lost(self, *, now: bool = False) -> None:
         """Raise LockstepError if messages between the world and the process are known to be lost.

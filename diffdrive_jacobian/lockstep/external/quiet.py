@@ -340,8 +340,10 @@ class Quiet:
         """Return whether a thread that waits with a timeout does so neither in DDS nor always."""
         if self._places is None or thread.own:
             return False
-        top = int(arguments[-2], 16)
-        if top < self._depths.get(thread.tid, top) - DEEPER:
+        if thread.tid not in self._depths:
+            # A new thread, as an executor starts them for callbacks.
+            return True
+        if int(arguments[-2], 16) < self._depths[thread.tid] - DEEPER:
             return True
         if thread.tid in self._polling:
             return False
