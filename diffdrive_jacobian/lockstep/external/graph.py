@@ -60,9 +60,8 @@ def shared_topics(nodes: Sequence[NodeGraph]) -> list[str]:
     return sorted(topic for topic in heard if counts[topic] > 1)
 
 
-def rules_apart(nodes: Sequence[NodeGraph]) -> list[str]:
+def rules_apart(topics: Iterable[str]) -> list[str]:
     """Return arguments that give each node of a process topics of its own, below its name."""
-    topics = sorted({topic for node in nodes for topic in node.topics})
     return ['--ros-args', *(word for topic in topics for word in ('-r', f'{topic}:=~/{APART}{topic}'))]
 
 

@@ -47,6 +47,7 @@ from diffdrive_jacobian.lockstep.external.quiet import (
 from diffdrive_jacobian.lockstep.external.relays import CALL, INPUT, SERVICE, TOPIC, Arrived, Relay
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.names import node_of
+from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.ros.fastdds_profiles import for_other_process
 from diffdrive_jacobian.ros.rclpy_internals import (
     graph_changed,
@@ -194,8 +195,8 @@ class NodeProcess:
         self._ended: list[ExternalProcess] = []
         self._names: set[str] = set()
         """Of all nodes that it has had."""
-        self._rules: list[str] = []
-        """Arguments that give each of its nodes topics of its own, if there are several."""
+        self._apart = {CLOCK} if command.use_sim_time else set[str]()
+        """Topics of which each of its nodes has its own."""
         self._closing = ExitStack()
         self._reset()
         self._scheduler.links.filter(self._drop_echoes, first=True)
@@ -215,6 +216,7 @@ class NodeProcess:
         self._qualities: dict[tuple[int, str], set[graphs.Quality]] = {}
         self._sent: dict[str, list[bytes]] = {}
         self._clock_publishers: dict[str, Publisher] = {}
+        self._clock_owners: dict[str, StandIn] = {}
         self._participants: set[int] = set()
         self._called: dict[str, tuple[str, StandIn]] = {}
         self._services_changed = True
@@ -316,6 +318,8 @@ class NodeProcess:
             try:
                 self._launch()
                 self._connect()
+                # Others may have been discovered meanwhile.
+                self._learn()
                 if not self._share_topics():
                     break
                 # Again, with topics of their own.
@@ -345,7 +349,7 @@ class NodeProcess:
         )
         self._closing.callback(self._outside.destroy_node)
         receiving = threads_of_this_process() - before
-        self.child = self._command.start(domain, self._rules)
+        self.child = self._command.start(domain, graphs.rules_apart(sorted(self._apart)))
         self._quiet = Quiet(self.child.root, receiving)
         self._closing.callback(self._quiet.close)
         self.child.check_addresses()
@@ -457,19 +461,17 @@ class NodeProcess:
         Raises:
             LockstepError: They share one although they were given topics of their own.
         """
-        # Others may have been discovered meanwhile.
-        self._learn()
         found = graphs.nodes_beside(self._outside)
         shared = graphs.shared_topics(found)
         if not shared:
             return False
-        if self._rules:
+        if self._connected or not self._apart.isdisjoint(shared):
             raise LockstepError(
-                f'several nodes of {self.child.title} share {", ".join(shared)}, which start() cannot '
-                'separate: the command remaps it itself, or it was created later; which of them '
-                'receives a message first would differ: start each node by itself'
+                f'several nodes of {self.child.title} share {", ".join(shared)}, which cannot be '
+                'separated: the command remaps it itself, or it was created after the start; which of '
+                'them receives a message first would differ: start each node by itself'
             )
-        self._rules = graphs.rules_apart(found)
+        self._apart |= {graph.name_in_world(topic) for graph in found for topic in graph.topics}
         return True
 
     def _check_order(self) -> None:
@@ -478,7 +480,8 @@ class NodeProcess:
         Raises:
             LockstepError: It is not.
         """
-        for (stand_in, topic), name in self._topics.items():
+        clocks = {(node, CLOCK): name for name, node in self._clock_owners.items()}
+        for (stand_in, topic), name in {**self._topics, **clocks}.items():
             infos = self._outside.get_subscriptions_info_by_topic(name)
             owner = stand_in.get_fully_qualified_name()
             if (number := sum(node_of(info) == owner for info in infos)) > 1:
@@ -513,7 +516,9 @@ class NodeProcess:
             for service, kind in graph.services.items():
                 self._relay(SERVICE, service, kind, node, relays.offered_service, self._deliver)
             for service, kind in graph.clients.items():
-                if service not in offered:
+                # A request to a service that does not know its client yet would be lost.
+                known = self._outside.get_publishers_info_by_topic(f'rq{service}Request', no_mangle=True)
+                if service not in offered and known:
                     self._called.setdefault(service, (kind, node))
         self._offer_called()
         return bool(found)
@@ -532,6 +537,7 @@ class NodeProcess:
             if kind == graphs.CLOCK_TYPE and topic.rpartition('/')[2] == 'clock':
                 if own not in self._clock_publishers:
                     self._clock_publishers[own] = outside.create_publisher(Clock, own, 1)
+                    self._clock_owners[own] = node
                 continue
             self._topics[node, topic] = own
             depth = self._command.queue_depth
@@ -583,6 +589,8 @@ class NodeProcess:
             if node not in self._stand_ins.values()
             for service in node.services
         }
+        for key in [(role, name) for role, name in self._relays if role == CALL and name not in there]:
+            self._relays.pop(key).close()
         for name, (kind, node) in self._called.items():
             if name in there:
                 self._relay(
@@ -642,7 +650,8 @@ class NodeProcess:
             if allowance.is_used_up():
                 raise LockstepError(
                     f'{name} does not respond: the executor of the node does not spin, or waits for '
-                    'what comes later, as a service in its constructor; '
+                    'what comes later, as a service in its constructor (a node that is spun in '
+                    'callbacks only needs start_parameter_services=False); '
                     f'{self._quiet.describe()}\n{self.describe()}'
                 )
             overdue = response is None and time.monotonic() > begin + number * REPETITION
@@ -722,9 +731,9 @@ class NodeProcess:
                 return 0
         begin = time.monotonic()
         if self._services_changed:
-            known = len(self._relays)
+            known = set(self._relays)
             self._offer_called()
-            if len(self._relays) > known:
+            if self._relays.keys() - known:
                 # The process may call them at once.
                 self._confirm(Allowance(self._quiet, self._command.timeout))
                 self._wait()
@@ -753,6 +762,10 @@ class NodeProcess:
         """Create what is needed for topics and services that the process has created meanwhile."""
         known = len(self._relays)
         self._learn()
+        self._share_topics()
+        self._check_order()
+        if untimed := self._untimed():
+            raise LockstepError(f'{", ".join(untimed)} has stopped to follow simulated time')
         if len(self._relays) > known:
             self._connect()
             self._add_nodes()

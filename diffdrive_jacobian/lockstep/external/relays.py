@@ -228,8 +228,12 @@ def called_service(
         while (taken := take_request(service)) is not None:
             yield Arrived(f'called {name}', True, partial(forward, *taken))
 
+    def close() -> None:
+        outside.destroy_service(service)
+        inside.destroy_client(client)
+
     # A server does not know its clients.
-    return Relay(lambda: True, take)
+    return Relay(lambda: True, take, close)
 
 
 def without_echo(
