@@ -260,6 +260,15 @@ class Growing(Controller):
             self.executor.add_node(self.child)
 
 
+class Spied(Controller):
+    """Creates a node that hears the same topic."""
+
+    def on_odometry(self, odometry):
+        super().on_odometry(odometry)
+        self.spy = Node('spy')
+        self.spy.create_subscription(Odometry, 'spied/odom', print, 10)
+
+
 class Sleeping(Controller):
     def on_odometry(self, odometry):
         time.sleep(0.004)
@@ -374,6 +383,7 @@ NODES = {
     'asking': Asking,
     'asking_first': AskingFirst,
     'growing': Growing,
+    'spied': Spied,
     'sleeping': Sleeping,
     'blocking': Blocking,
     'starting': Starting,

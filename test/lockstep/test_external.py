@@ -18,9 +18,10 @@ import pytest
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterType
-from rcl_interfaces.srv import GetParameters
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.action import ActionClient
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
@@ -600,6 +601,44 @@ def test_topics_that_cannot_be_separated_are_refused():
         [*command('shared', 'other'), '--ros-args', '-r', 'words:=sentences'],
         'several nodes of .* share /sentences, which',
     )
+
+
+def test_a_topic_that_is_shared_later_is_refused(lockstep):
+    lockstep.start(command('spied'))
+
+    def drive():
+        for _ in range(5):
+            lockstep.publish('spied/odom', odometry())
+            lockstep.run_for(1.0)
+
+    with pytest.raises(LockstepError, match=r'several nodes of .* share /spied/odom, which cannot be'):
+        drive()
+
+
+def test_a_node_that_stops_to_follow_simulated_time_is_named(lockstep):
+    lockstep.start(command('echo'))
+    timed = Parameter('use_sim_time', value=False).to_parameter_msg()
+
+    def change():
+        lockstep.call(SetParameters, 'echo/set_parameters', SetParameters.Request(parameters=[timed]))
+        lockstep.run_for(5.0)
+
+    with pytest.raises(LockstepError, match='/echo has stopped to follow simulated time'):
+        change()
+
+
+def test_a_process_whose_endpoints_are_not_matched_is_started_again(lockstep, monkeypatch):
+    matched = node_process.NodeProcess._is_matched
+    started = []
+
+    def match_at_the_second_start(process):
+        if process.pid not in started:
+            started.append(process.pid)
+        return len(started) > 1 and matched(process)
+
+    monkeypatch.setattr(node_process.NodeProcess, '_is_matched', match_at_the_second_start)
+    monkeypatch.setattr(node_process, 'MATCHING', 0.1)
+    assert lockstep.start(command('echo')).pid == started[1]
 
 
 def test_nodes_of_equal_names_are_refused():

@@ -10,6 +10,7 @@ any other node.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -67,6 +68,10 @@ SILENCE = 0.2
 """Time for which a process that has started must not send anything by itself (s)."""
 SUBSCRIBING = 3.0
 """Least time until a node must be subscribed to /clock (s): its name may be discovered before."""
+MATCHING = 5.0
+"""Time after which a process is started again if endpoints that were discovered are not matched (s)."""
+LOOP = 2.0
+"""Longest time until an executor that waits with a timeout does so again (s)."""
 UNCONFIRMED = 0.5
 """Time for nodes without parameter services to discover the endpoints of the world (s)."""
 UNASKED = 100
@@ -77,6 +82,10 @@ SYNCHRONOUS = {'RMW_FASTRTPS_PUBLICATION_MODE': 'SYNCHRONOUS'}
 """Environment of processes: a thread of Fast DDS would publish later what is published at once."""
 ATTEMPTS = 2
 """Number of domains that are tried, if a program that the world has not started comes into one."""
+
+
+class UnmatchedError(LockstepError):
+    """DDS does not match endpoints that have been discovered, as happens rarely."""
 
 
 class ForeignNodeError(LockstepError):
@@ -317,7 +326,7 @@ class NodeProcess:
         while True:
             try:
                 self._launch()
-                self._connect()
+                self._connect(MATCHING if attempt < ATTEMPTS - 1 else math.inf)
                 # Others may have been discovered meanwhile.
                 self._learn()
                 if not self._share_topics():
@@ -327,7 +336,7 @@ class NodeProcess:
             except BaseException as error:
                 self.close()
                 attempt += 1
-                if not isinstance(error, ForeignNodeError) or attempt == ATTEMPTS:
+                if not isinstance(error, (ForeignNodeError, UnmatchedError)) or attempt == ATTEMPTS:
                     raise
         self._extend(time.monotonic() - begin)
         return list(self._stand_ins.values())
@@ -416,15 +425,28 @@ class NodeProcess:
 
     # --- Discovery
 
-    def _connect(self) -> None:
-        """Wait until the nodes of the process and the world have discovered each other."""
+    def _connect(self, matching: float = math.inf) -> None:
+        """Wait until the nodes of the process and the world have discovered each other.
+
+        Args:
+            matching: Longest time until what is discovered is matched, too (s).
+
+        Raises:
+            UnmatchedError: That has passed.
+            LockstepError: They have not discovered each other, or cannot take part.
+        """
         allowance = Allowance(self._quiet, self._command.timeout)
+        matched_by: Allowance | None = None
         subscribing: Allowance | None = None
         while True:
             while not (self._learn() and self._is_matched()):
                 self.child.check_running()
                 if allowance.is_used_up():
                     raise LockstepError(self._not_discovered())
+                if self._stand_ins:
+                    matched_by = matched_by or Allowance(self._quiet, matching)
+                    if matched_by.is_used_up():
+                        raise UnmatchedError(self._not_discovered())
                 time.sleep(PERIOD)
             known = len(self._relays)
             self._confirm(allowance)
@@ -442,6 +464,13 @@ class NodeProcess:
                 time.sleep(SILENCE)
         self._wait()
         self._check_order()
+        # A node may wait for something before it spins, with a timeout.
+        looping = Allowance(self._quiet, LOOP)
+        self._quiet.learn()
+        while not (self._quiet.loops or looping.is_used_up()):
+            time.sleep(PERIOD)
+            self._wait()
+            self._quiet.learn()
         # Others than latched ones came before anybody could be subscribed.
         self._lasting = [arrived for arrived in self._take() if arrived.lasting]
         time.sleep(SILENCE)
@@ -654,6 +683,9 @@ class NodeProcess:
                     'callbacks only needs start_parameter_services=False); '
                     f'{self._quiet.describe()}\n{self.describe()}'
                 )
+            if graph_changed(self._outside):
+                # The node may wait for a service of the world before it spins.
+                self._learn()
             overdue = response is None and time.monotonic() > begin + number * REPETITION
             if overdue and client.service_is_ready():
                 number = send_request(client, GetParameters.Request(names=['use_sim_time']))

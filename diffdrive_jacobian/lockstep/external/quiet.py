@@ -164,6 +164,10 @@ class Quiet:
         self._ended: set[int] = set()
         self.waits_in_callback = False
         """Whether all was quiet at the last look but for callbacks that wait with a timeout."""
+        self.loops = True
+        """Whether all executors that wait with a timeout have done so several times."""
+        self._loops: dict[tuple[int, int], int] = {}
+        """How often such a thread had run when it was first seen at this place."""
         self._depths: dict[int, int] = {}
         """Address of the top of the stack of each thread in an idle process."""
 
@@ -324,6 +328,7 @@ class Quiet:
     def learn(self) -> None:
         """Note which threads wait with a timeout, and how: the process is idle, and was found quiet."""
         timed = []
+        self.loops = True
         for thread in self._threads.values():
             number, *arguments = thread.idle.split() or [b'']
             if arguments:
@@ -334,6 +339,14 @@ class Quiet:
             thread.idle = b''
         named = [found for thread, found in timed if thread.read('comm').startswith('dds.')]
         self._places = {min(found) for found in named if found}
+        loops = {}
+        for thread, found in timed:
+            if not (self._places.isdisjoint(found) or thread.read('comm').startswith('dds.')):
+                key = thread.tid, self._depths[thread.tid]
+                times = int(thread.read('schedstat').split()[2])
+                loops[key] = min(times, self._loops.get(key, times))
+                self.loops = self.loops and times > loops[key]
+        self._loops = loops
         self._polling = {thread.tid for thread, found in timed if self._places.isdisjoint(found)}
 
     def _is_in_callback(self, thread: _Thread, arguments: list[bytes]) -> bool:
