@@ -641,6 +641,17 @@ def test_a_process_whose_endpoints_are_not_matched_is_started_again(lockstep, mo
     assert lockstep.start(command('echo')).pid == started[1]
 
 
+def test_several_nodes_in_cpp_are_warned_of(lockstep, monkeypatch, recwarn):
+    lockstep.start(command('echo', 'mute'))
+    # As if it were in C++: a library that the process has.
+    monkeypatch.setattr(quietness, 'RCLCPP', '_rclpy_pybind11')
+    lockstep.start(command('double'))
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match='rclcpp calls timers of one of several nodes') as warned:
+        lockstep.start(command('ticker', 'bare'))
+    assert warned[0].filename == __file__
+
+
 def test_nodes_of_equal_names_are_refused():
     refused(command('shared', 'shared'), 'several nodes of .* have the name /shared')
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -481,6 +482,18 @@ class NodeProcess:
         self._quiet.learn()
         for pid in self._participants:
             self._datagrams.watch(pid)
+        self._warn()
+
+    def _warn(self) -> None:
+        """Warn of what may differ from run to run without an error."""
+        threads = max(map(self._quiet.cpp_executor_threads, self._participants), default=0)
+        why = ''
+        if threads > 1:
+            why = 'an executor with several threads may execute callbacks at the same time'
+        elif threads and len(self._stand_ins) > 1:
+            why = 'rclcpp calls timers of one of several nodes that are due at once in any order'
+        if why and not self._connected:
+            warnings.warn(f'{self.child.title}: {why}; check_repeats shows it', stacklevel=5)
 
     def _share_topics(self) -> bool:
         """Return whether several nodes of the process have a topic that they need not share.

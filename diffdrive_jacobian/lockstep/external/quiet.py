@@ -46,6 +46,8 @@ WAITS = {
 poll, select, epoll; and of recvfrom, recvmsg, wait4, waitid, which have none."""
 ENDLESS = (b'0x0', b'0xffffffff', b'0xffffffffffffffff')
 """Timeouts that are none."""
+RCLCPP = 'librclcpp.so'
+"""Library of nodes in C++."""
 DDS = 'libfastrtps.so'
 """Library whose waits are those of an idle node."""
 DEEPER = 1024
@@ -366,15 +368,23 @@ class Quiet:
         """Return at which places on its stack a thread has addresses of code of DDS."""
         pid = thread.pid
         if pid not in self._dds:
-            self._dds[pid] = [
-                range(*(int(end, 16) for end in line.split()[0].split('-')))
-                for line in thread.read('maps').splitlines()
-                if DDS in line and 'x' in line.split()[1]
-            ]
-        words = array('Q')
-        with suppress(OSError), open(f'/proc/{pid}/mem', 'rb', buffering=0) as memory:
-            words.frombytes(os.pread(memory.fileno(), STACK, int(arguments[-2], 16)))
+            self._dds[pid] = _code(thread, DDS)
+        words = _stack(thread, arguments)
         return {place for place, word in enumerate(words) for code in self._dds[pid] if word in code}
+
+    def cpp_executor_threads(self, pid: int) -> int:
+        """Return how many threads of executors an idle process in C++ has. 0: it is not in C++."""
+        threads = [thread for thread in self._threads.values() if thread.pid == pid]
+        code = _code(threads[0], RCLCPP) if threads else []
+        if not code:
+            return 0
+        found = 0
+        for thread in threads:
+            call = thread.read('syscall').encode().split()
+            if len(call) > 2 and not self._addresses(thread, call[1:]):
+                found += any(word in part for word in _stack(thread, call) for part in code)
+        # One of them waits for DDS, and one of rclcpp's threads, which is none of them, for signals.
+        return max(found, 1)
 
     # --- Which threads there are
 
@@ -429,6 +439,23 @@ class Quiet:
         command = thread.read('cmdline').replace('\0', ' ').strip()
         name = thread.read('comm').strip()
         return f"thread {thread.tid} ('{name}') of {command} (pid {thread.pid}) {self._why}"
+
+
+def _code(thread: _Thread, library: str) -> list[range]:
+    """Return the addresses of the code of a library in the process of a thread."""
+    return [
+        range(*(int(end, 16) for end in line.split()[0].split('-')))
+        for line in thread.read('maps').splitlines()
+        if library in line and 'x' in line.split()[1]
+    ]
+
+
+def _stack(thread: _Thread, call: list[bytes]) -> array[int]:
+    """Return the top of the stack of a thread that waits in a system call."""
+    words = array('Q')
+    with suppress(OSError), open(f'/proc/{thread.pid}/mem', 'rb', buffering=0) as memory:
+        words.frombytes(os.pread(memory.fileno(), STACK, int(call[-2], 16)))
+    return words
 
 
 class Allowance:
