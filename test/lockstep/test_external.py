@@ -357,6 +357,37 @@ def test_a_last_command_of_a_process_that_is_stopped_is_received(lockstep):
 # --- Faults and properties
 
 
+INTERRUPTED = """
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import String
+
+rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+node = rclpy.create_node('interrupted')
+publisher = node.create_publisher(String, 'last', 10)
+try:
+    rclpy.spin(node)
+except KeyboardInterrupt:
+    publisher.publish(String(data='last'))
+"""
+
+
+def test_a_program_that_waits_is_woken_up_to_be_interrupted(lockstep):
+    process = lockstep.start([sys.executable, '-c', INTERRUPTED])
+    last = lockstep.listen(String, 'last')
+    assert process.stop() == 0
+    lockstep.settle()
+    assert [one.data for one in last] == ['last']
+
+
+def test_a_node_is_gone_when_its_process_was_ended(lockstep, robot_at):
+    robot = robot_at()
+    lockstep.start(command('echo')).kill()
+    assert lockstep.find('virtual_robot') is robot
+    with pytest.raises(LockstepError, match='no node'):
+        lockstep.find('echo')
+
+
 def test_faults_of_topics_affect_both_directions(lockstep):
     lockstep.start(command('echo'))
     commands = lockstep.listen(TwistStamped, 'echo/cmd_vel')

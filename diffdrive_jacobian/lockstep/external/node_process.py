@@ -14,8 +14,8 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -41,6 +41,7 @@ from diffdrive_jacobian.lockstep.external import relays
 from diffdrive_jacobian.lockstep.external.datagrams import LIMIT, QUEUE, Datagrams, sockets_of
 from diffdrive_jacobian.lockstep.external.process import CLOSING, ExternalProcess, free_domain
 from diffdrive_jacobian.lockstep.external.quiet import (
+    LONGEST,
     Allowance,
     Quiet,
     own_run_times,
@@ -281,7 +282,9 @@ class NodeProcess:
         """
         checked_nanoseconds('timeout', timeout)
         self._forget()
-        return self._stop(timeout)
+        code = self._stop(timeout)
+        self._scheduler.forget_destroyed()
+        return code
 
     def _stop(self, timeout: float = CLOSING) -> int:
         code = self.child.stop(timeout)
@@ -296,11 +299,18 @@ class NodeProcess:
         """Kill it. Nothing that was sent to it is processed, and a fault does not start it again."""
         self._forget()
         self._kill()
+        self._scheduler.forget_destroyed()
 
     def _kill(self) -> None:
         self._scheduler.killed.update(self._stand_ins.values())
         self.child.kill()
         self._leave()
+
+    def _wake(self) -> None:
+        """Send the time that the nodes have, for nothing but to wake them up."""
+        if self._connected:
+            for publisher in self._clock_publishers.values():
+                raw_sender(publisher)(self._time_message(self._clocks.now))
 
     def _forget(self) -> None:
         """Do not let a fault start it again."""
@@ -319,10 +329,14 @@ class NodeProcess:
         Raises:
             LockstepError: They are not within the timeout, or cannot take part.
         """
-        begin = time.monotonic()
         if hasattr(self, 'child'):
             self.child.close()
             self._ended.append(self.child)
+        with self._uncounted():
+            self._launch_and_connect()
+        return list(self._stand_ins.values())
+
+    def _launch_and_connect(self) -> None:
         attempt = 0
         while True:
             try:
@@ -339,8 +353,6 @@ class NodeProcess:
                 attempt += 1
                 if not isinstance(error, (ForeignNodeError, UnmatchedError)) or attempt == ATTEMPTS:
                     raise
-        self._extend(time.monotonic() - begin)
-        return list(self._stand_ins.values())
 
     def _launch(self) -> None:
         """Start the process, and create what is needed to receive from it."""
@@ -360,6 +372,7 @@ class NodeProcess:
         self._closing.callback(self._outside.destroy_node)
         receiving = threads_of_this_process() - before
         self.child = self._command.start(domain, graphs.rules_apart(sorted(self._apart)))
+        self.child.wake = self._wake
         self._quiet = Quiet(self.child.root, receiving)
         self._closing.callback(self._quiet.close)
         self.child.check_addresses()
@@ -493,7 +506,7 @@ class NodeProcess:
         elif threads and len(self._stand_ins) > 1:
             why = 'rclcpp calls timers of one of several nodes that are due at once in any order'
         if why and not self._connected:
-            warnings.warn(f'{self.child.title}: {why}; check_repeats shows it', stacklevel=5)
+            warnings.warn(f'{self.child.title}: {why}; check_repeats shows it', stacklevel=6)
 
     def _share_topics(self) -> bool:
         """Return whether several nodes of the process have a topic that they need not share.
@@ -680,8 +693,11 @@ class NodeProcess:
         for name in names:
             self._await_response(name, allowance)
         if len(names) < len(self._stand_ins):
+            known = len(self._relays)
             time.sleep(UNCONFIRMED)
-            self._wait()
+            self._learn()
+            if len(self._relays) == known:
+                self._wait()
 
     def _await_response(self, name: str, allowance: Allowance) -> None:
         """Ask a node for a parameter until it has responded to the last request, so to all of them."""
@@ -743,13 +759,17 @@ class NodeProcess:
         if now == self._given:
             return FREE
         self._given = now
-        message = Clock()
-        set_time(message.clock, now)
-        data = serialize_message(message)
+        data = self._time_message(now)
         # One after the other, so that the nodes of a process do not act at the same time.
         senders = [raw_sender(publisher) for publisher in self._clock_publishers.values()]
         sent = [self._exchange(partial(send, data)) for send in senders]
         return None if any(sent) else FREE
+
+    @staticmethod
+    def _time_message(now: int) -> bytes:
+        message = Clock()
+        set_time(message.clock, now)
+        return bytes(serialize_message(message))
 
     def _respond(self, send: Callable[[], object]) -> None:
         """Send a response to the process, and what had to wait for that."""
@@ -774,22 +794,21 @@ class NodeProcess:
             if not response:
                 self._held.append(send)
                 return 0
-        begin = time.monotonic()
-        if self._services_changed:
-            known = set(self._relays)
-            self._offer_called()
-            if self._relays.keys() - known:
-                # The process may call them at once.
-                self._confirm(Allowance(self._quiet, self._command.timeout))
-                self._wait()
-        self._refuse(self._take())
-        send()
-        self._wait()
-        arrived = self._take()
-        self.check_lost()
-        for sent in self._sent.values():
-            sent.clear()
-        self._extend(time.monotonic() - begin)
+        with self._uncounted():
+            if self._services_changed:
+                known = set(self._relays)
+                self._offer_called()
+                if self._relays.keys() - known:
+                    # The process may call them at once.
+                    self._confirm(Allowance(self._quiet, self._command.timeout))
+                    self._wait()
+            self._refuse(self._take())
+            send()
+            self._wait()
+            arrived = self._take()
+            self.check_lost()
+            for sent in self._sent.values():
+                sent.clear()
         self._forward(arrived)
         if any(map(self._quiet.has_ended, (self.child.root, *self._participants))):
             self._on_end()
@@ -829,9 +848,20 @@ class NodeProcess:
                 'start(..., patience=)\n' + self.describe()
             ) from None
 
+    @contextmanager
+    def _uncounted(self) -> Iterator[None]:
+        """Let wall time pass that is not that of callbacks in this process. It has limits of its own."""
+        begin, longest = time.monotonic(), LONGEST * max(self._command.patience, self._command.timeout)
+        self._extend(longest)
+        try:
+            yield
+        finally:
+            self._extend(time.monotonic() - begin - longest)
+
     def _check_waits(self) -> None:
         """Check that a callback which waits for a response of the world still does."""
-        self._wait()
+        with self._uncounted():
+            self._wait()
         if not self._quiet.waits_in_callback:
             raise LockstepError(
                 f'a callback of {", ".join(self._stand_ins)} waited for the response of a service until '
@@ -874,9 +904,8 @@ class NodeProcess:
 
     def _end_waits(self) -> None:
         """Wait until callbacks that wait for responses have waited in vain, and go on."""
-        begin = time.monotonic()
-        self._wait(lambda: False)
-        self._extend(time.monotonic() - begin)
+        with self._uncounted():
+            self._wait(lambda: False)
         held, self._held = self._held, []
         self._forward(self._take())
         self.check_lost()
@@ -906,7 +935,8 @@ class NodeProcess:
             what = ', '.join(dict.fromkeys(one.what for one in arrived))
             raise LockstepError(
                 f'{names} {what} at {self._clocks.now / NANOSECONDS:g} s, while nothing was delivered '
-                'to it: what it sends then differs from run to run. Likely a timer on wall time '
+                'to it: what it sends then differs from run to run. Likely '
+                f'{"" if self._command.use_sim_time else "use_sim_time=False, "}a timer on wall time '
                 '(create_wall_timer), a thread of its own, or a callback that had not ended, because it '
                 'waited for something else than a message\n' + self.describe()
             )

@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -109,6 +109,8 @@ class ExternalProcess:
         """The command line as errors name it."""
         self.ended_by_test = False
         """Whether the test has ended it."""
+        self.wake: Callable[[], object] = lambda: None
+        """Called while it is waited for: Python notices a signal only when its node is woken up."""
         self._files = [tempfile.TemporaryFile() for _ in range(2)]  # noqa: SIM115
         self._printed = ['', '']
         # Not what isolates this process, or the profiles of Fast DDS that it uses.
@@ -196,6 +198,7 @@ class ExternalProcess:
         self.signal(signal.SIGINT)
         end = time.monotonic() + timeout
         while (code := self.returncode) is None and time.monotonic() < end:
+            self.wake()
             time.sleep(NAP)
         return self.kill() if code is None else code
 
