@@ -358,6 +358,8 @@ def test_a_last_command_of_a_process_that_is_stopped_is_received(lockstep):
 
 
 INTERRUPTED = """
+import time
+
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
@@ -369,6 +371,8 @@ try:
     rclpy.spin(node)
 except KeyboardInterrupt:
     publisher.publish(String(data='last'))
+    # If it ended at once, its end might be discovered before the message is received.
+    time.sleep(0.5)
 """
 
 
