@@ -1,8 +1,9 @@
 """A process whose nodes take part in a lockstep world, unchanged, each with a node that stands for it.
 
 Each process has a ROS domain of its own, in which the world has an endpoint for each of its topics and
-services. So its nodes keep all their names, and no process receives what another one sends directly. In
-the world stands a `StandIn` for each of its nodes, with the same name, topics and services. What that
+services. So no process receives what another one sends directly. Names stay, but for /clock and for
+topics that several nodes of a process share: those are remapped below the name of each node. In the
+world stands a `StandIn` for each of its nodes, with the same name, topics and services. What that
 receives is sent to the process, one message at a time, and the world waits until the process is quiet.
 What it has sent meanwhile is published by the stand-in. So faults, properties and recordings treat it as
 any other node.
@@ -83,7 +84,7 @@ END = 2.0
 SYNCHRONOUS = {'RMW_FASTRTPS_PUBLICATION_MODE': 'SYNCHRONOUS'}
 """Environment of processes: a thread of Fast DDS would publish later what is published at once."""
 ATTEMPTS = 2
-"""Number of domains that are tried, if a program that the world has not started comes into one."""
+"""Number of starts, if another program comes into the domain, or endpoints are not matched."""
 
 
 class UnmatchedError(LockstepError):
@@ -275,7 +276,8 @@ class NodeProcess:
     def stop(self, timeout: float = CLOSING) -> int:
         """End it by SIGINT, and kill it if it does not end. Return the exit code.
 
-        What it publishes at its end is received by the others. A fault does not start it again.
+        What it publishes then is received by the others, unless it ends at the same moment. A fault does
+        not start it again.
 
         Args:
             timeout: Longest time for its end (s).
