@@ -184,17 +184,20 @@ def test_drive_to_arrives(world):
 
 def test_drive_to_is_not_discovered(world, monkeypatch):
     peer = world.harness.peer
-    children = [world.start('drive_to', '--no-record', '0.05', '0', *FAST)]
+    arguments = ('--no-record', '0.05', '0', *FAST, '-r', '__ns:=/hidden')
+    children = [world.start('drive_to', *arguments)]
     # The older variable does not open it.
     monkeypatch.setenv('ROS_LOCALHOST_ONLY', '1')
-    children.append(world.start('drive_to', '--no-record', '0.05', '0', *FAST))
+    children.append(world.start('drive_to', *arguments))
     seen = set()
     while any(child.running for child in children):
         world.harness.executor.spin_once(timeout_sec=0.01)
-        seen |= set(peer.get_node_names()) | {name for name, _ in peer.get_topic_names_and_types()}
+        seen |= {f'{namespace}/{name}' for name, namespace in peer.get_node_names_and_namespaces()}
+        seen |= {name for name, _ in peer.get_topic_names_and_types()}
     for child in children:
         assert_arrived(child, 0.05, 0.0)
-    assert seen == {'peer', '/parameter_events', '/rosout'}
+    assert '//peer' in seen
+    assert not any('hidden' in name for name in seen)
 
 
 def test_drive_to_open_survives_invalid_messages_and_reports_where_the_robot_stopped(world):

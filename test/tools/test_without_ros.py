@@ -107,16 +107,15 @@ def test_tools_work_as_with_ros(tmp_path, ours):
 def test_a_journal_is_recovered(tmp_path):
     """Of types that are not known the messages are saved, and reported as not checked."""
     writer = JournalWriter(tmp_path / 'run.journal.mcap')
-    mine = Channel(
-        id=0, topic='/x', type_name='a_msgs/msg/A', definition='int32 a\n', type_hash='RIHS01_0'
-    )
     known = known_definition('nav_msgs/msg/Odometry')
-    theirs = Channel(
-        id=1, topic='/odom', type_name=known.name, definition=known.text, type_hash=known.type_hash
-    )
+    mine = {'type_name': 'a_msgs/msg/A', 'definition': 'int32 a\n', 'type_hash': 'RIHS01_0'}
+    theirs = {'type_name': known.name, 'definition': known.text, 'type_hash': known.type_hash}
     for record in (
-        *(mine, theirs, Message(0, SECOND, b'\0\1\0\0\1\0\0\0')),
-        *(Message(1, SECOND, data) for data in (serialize_message(odom(0, 0, 0)), b'\0\1\0\0xyz')),
+        Channel(id=0, topic='/x', **mine),
+        Channel(id=1, topic='/odom', **theirs),
+        Message(0, SECOND, b'\0\1\0\0\1\0\0\0'),
+        Message(1, SECOND, serialize_message(odom(0, 0, 0))),
+        Message(1, SECOND, b'\0\1\0\0xyz'),
     ):
         writer.add(record)
     writer.flush()
