@@ -93,6 +93,15 @@ def test_drive_to_live_waits_for_the_page_records_and_ends_by_a_signal(world, tm
     assert watch.exit() == 0
 
 
+@pytest.mark.process
+def test_drive_to_live_in_real_time(world):
+    drive = world.start('drive_to', '0.1', '0', '--live', '--no-record', '--no-browser', *QUICK)
+    with opened(drive) as page:
+        until(lambda: robots(page).get('/', {}).get('goal', {}).get('state') == 'succeeded', 'arrives')
+    drive.signal(signal.SIGINT)
+    assert (drive.exit(), drive.stderr) == (0, '')
+
+
 # --- Arguments
 
 
