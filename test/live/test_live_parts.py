@@ -57,15 +57,11 @@ def test_commands_are_parsed():
     ('content', 'words'),
     [
         (b'{}', 'must be text'),
-        ('{"do": "step"', 'must be JSON'),
         ('[' * 3000, 'must be JSON'),
         ([], 'must be a JSON object'),
-        ({'do': ['goal']}, 'do must be one of goal'),
         ({'do': 'shutdown'}, "do must be one of .*, got 'shutdown'"),
         ({**DRIVE, 'more': 1}, 'drive must have the keys robot, v, omega'),
-        ({'do': 'drive', 'robot': '/'}, 'drive must have the keys'),
         ({**DRIVE, 'v': True}, 'v must be a number'),
-        ({**DRIVE, 'v': '1'}, "v must be a number, got '1'"),
         ({**DRIVE, 'v': 10**400}, r'v must be in \[-1000, 1000\], got 1000000'),
         ({**DRIVE, 'v': math.nan}, 'must be JSON'),
         (json.dumps(DRIVE).replace('0.2', '1e999'), r'v must be in \[-1000, 1000\], got inf'),
@@ -77,7 +73,6 @@ def test_commands_are_parsed():
         ({**GOAL, 'append': 0}, 'append must be True or False, got 0'),
         ({**GOAL, 'theta': 99.0}, r'theta must be in \[-6.28319, 6.28319\] rad, got 99.0'),
         ({**GOAL, 'x': 1e7}, r'x must be in \[-1e\+06, 1e\+06\] m, got 10000000.0'),
-        ({'do': 'place', 'robot': '/', 'x': 0, 'y': 0, 'theta': None}, 'theta must be'),
         ({'do': 'speed', 'speed': 0}, r'speed must be in \[0.01, 1000\], got 0'),
     ],
 )
@@ -198,38 +193,6 @@ def test_goals_and_their_state():
     goal.reported(GoalState.SUCCEEDED, (1, 0))
     assert goal.current is None
     assert goal.shown()['state'] == 'succeeded'
-    # A status that overtakes its goal.
-    goal = GoalProgress()
-    goal.reported(GoalState.EXECUTING, (2, 0))
-    assert goal.active
-    assert goal.current is None
-    goal.sent(at(1.0), (2, 0))
-    np.testing.assert_array_equal(goal.current, [1.0, 0.0, 0.0])
-
-
-def test_the_end_of_each_goal_is_reported_once():
-    goal = GoalProgress()
-
-    def ends(state, stamp):
-        changed = goal.reported(state, stamp)
-        return changed is not None and changed.fate.is_end
-
-    goal.sent(at(1.0), (1, 0))
-    assert not ends(GoalState.EXECUTING, (1, 0))
-    assert ends(GoalState.SUCCEEDED, (1, 0))
-    assert not ends(GoalState.SUCCEEDED, (1, 0))
-    # One that is replaced does not end the other.
-    goal.sent(at(3.0), (3, 0))
-    assert not ends(GoalState.ACCEPTED, (3, 0))
-    goal.sent(at(4.0), (4, 0))
-    assert not ends(GoalState.CANCELED, (3, 0))
-    assert not ends(GoalState.ACCEPTED, (4, 0))
-    # Nor does one that is refused.
-    goal.sent(at(9.0), (5, 0))
-    goal.reported(GoalState.ABORTED, (5, 0))
-    goal.reported(GoalState.EXECUTING, (4, 0))
-    np.testing.assert_array_equal(goal.goals, at(4.0))
-    assert ends(GoalState.CANCELED, (4, 0))
 
 
 # --- Numbers

@@ -299,27 +299,21 @@ def test_output_that_cannot_be_written(folder, command, arguments, unbuffered):
 # --- Types of arguments
 
 
-ROS = ['--ros-args', '-p', 'x:=-1', '-r', '__ns:=/a']
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'own', 'ros'),
-    [
-        ([], [], []),
+def test_arguments_of_tool_and_ros_are_separated():
+    ros = ['--ros-args', '-p', 'x:=-1', '-r', '__ns:=/a']
+    for arguments, own, of_ros in (
+        # Negative numbers are no options.
         (['-1e-1', '-.5', '-1E+3', '-inf'], [' -1e-1', ' -.5', ' -1E+3', ' -inf'], []),
         (['--tolerance', '-1', '--timeout=-1'], ['--tolerance', ' -1', '--timeout=-1'], []),
         (['-h', '--open', '-', '-1m'], ['-h', '--open', '-', '-1m'], []),
-        (['1', *ROS, '--', '-1'], ['1', ' -1'], [*ROS, '--']),
-        ([*ROS, '--', '1', *ROS, '--', '1'], ['1', '1'], [*ROS, '--', *ROS, '--']),
+        ([*ros, '--', '1', *ros, '--', '-1'], ['1', ' -1'], [*ros, '--', *ros, '--']),
         (['1', '--', '-1'], ['1', '--', ' -1'], []),
         (['--ros-args', '--ros-args', '-1'], [], ['--ros-args', '--ros-args', '-1']),
-    ],
-)
-def test_arguments_of_tool_and_ros_are_separated(arguments, own, ros):
-    assert _cli.split_arguments(arguments) == (own, ros)
+    ):
+        assert _cli.split_arguments(arguments) == (own, of_ros)
 
 
-def test_headings_are_in_radians_or_degrees():
+def test_values_of_arguments():
     parser = _cli.Parser(prog='x')
     parser.add_heading('heading')
     for arguments, expected in (
@@ -329,6 +323,17 @@ def test_headings_are_in_radians_or_degrees():
         (['--degrees', '--heading', ' -360'], -math.tau),
     ):
         assert parser.given_heading(parser.parse_args(arguments)) == expected
+    for text, expected in (('robot1', '/robot1'), ('/a/b/', '/a/b'), ('/', '/'), ('', '/')):
+        assert _cli.namespace(text) == expected
+    for name in ('run', 'run.2', 'runs.png/run', 'run_2026_01_01-10_00_00', '.png'):
+        assert _cli.bag_folder(name) == name
+    for kind, wrong in (
+        (_cli.namespace, ('a b', '1a', 'a//b')),
+        (_cli.bag_folder, ('run.png', 'run.svg/', 'a/run.PDF', 'run.yaml')),
+    ):
+        for text in wrong:
+            with pytest.raises(argparse.ArgumentTypeError):
+                kind(text)
 
 
 def test_robots_stand_for_their_parameter_files():
@@ -339,19 +344,3 @@ def test_robots_stand_for_their_parameter_files():
     found = [Path(parser.parse_args(['--robot', name]).params_file).read_text() for name in names]
     assert found == [file.read_text() for file in files]
     assert f'of a robot: {", ".join(names)}' in ' '.join(parser.format_help().split())
-
-
-def test_namespaces():
-    for text, expected in (('robot1', '/robot1'), ('/a/b/', '/a/b'), ('/', '/'), ('', '/')):
-        assert _cli.namespace(text) == expected
-    for text in ('a b', '1a', 'a//b', 'a-b'):
-        with pytest.raises(argparse.ArgumentTypeError):
-            _cli.namespace(text)
-
-
-def test_a_bag_is_not_named_like_a_file():
-    for name in ('run.png', 'run.svg/', 'a/run.PDF', 'run.csv', 'run.txt', 'run.yaml'):
-        with pytest.raises(argparse.ArgumentTypeError):
-            _cli.bag_folder(name)
-    for name in ('run', 'run.2', 'runs.png/run', 'run_2026_01_01-10_00_00', '.png'):
-        assert _cli.bag_folder(name) == name

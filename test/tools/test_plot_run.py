@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,15 +13,13 @@ import pytest
 from support import commands
 from support.bags import SECOND, odom, write_bag
 from support.ros_messages import goal, joint_command, twist, twist_stamped
-from support.runs import RATE, run_of, sample
+from support.runs import RATE, sample
 
 from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.plots import run_figure
-from diffdrive_jacobian.plots.rendering import render
 from diffdrive_jacobian.plots.run_figure import LABELS, draw, figure, names
 from diffdrive_jacobian.plots.run_table import COLUMNS, decimal_seconds
-from diffdrive_jacobian.signals import CAUGHT, Signals
 
 plot = partial(commands.run, 'plot_run')
 refused = partial(commands.refused, 'plot_run')
@@ -139,16 +136,13 @@ def test_without_goals_wheels_and_limits_these_are_left_out(tmp_path):
     assert 'limit' not in legends(made)
 
 
-def test_a_robot_that_stands_is_drawn(tmp_path):
-    low, high = figure([run_of(tmp_path, count=1, v=0.0, omega=0.0)]).axes[0].get_xlim()
-    assert 0.4 < high - low < 5.0
-
-
-def test_no_line_leads_to_where_the_odometry_is_reset(tmp_path):
+def test_no_line_leads_to_where_the_odometry_is_reset_and_one_pose_is_drawn(tmp_path):
     sent = [(1.0 + k, '/odom', odom(5 * (k > 2), 0.01 * k, 0, seconds=1.0 + k)) for k in range(6)]
     made = figure([read_run(write_bag(tmp_path / 'bag', sent))])
     (path,) = (one for one in made.axes[0].lines if not one.get_label().startswith('_'))
     assert np.flatnonzero(np.isnan(path.get_xdata())).tolist() == [3]
+    low, high = figure([read_run(write_bag(tmp_path / 'one', sent[:1]))]).axes[0].get_xlim()
+    assert 0.4 < high - low < 5.0
 
 
 def test_everything_drawn_lies_inside_the_picture_whatever_the_users_style(run):
@@ -157,7 +151,7 @@ def test_everything_drawn_lies_inside_the_picture_whatever_the_users_style(run):
     with matplotlib.rc_context({'figure.figsize': (1, 1), 'text.usetex': True}):
         made = figure([run, replace(run, path=Path('second'))])
         assert matplotlib.rcParams['text.usetex'] is True
-    render(made, 'png')
+    made.draw_without_rendering()
     assert made.get_size_inches().tolist() == [11.0, 7.0]
     width, height = made.get_size_inches() * made.dpi
     boxes = [axes.get_tightbbox() for axes in made.axes]
@@ -230,8 +224,8 @@ def test_csv_prefers_the_commands_that_were_applied(folder):
     extra = [(10.0, '/cmd_vel', twist(9, 9)), (10.1, '/cmd_vel_out', twist_stamped(1, 2, 10 * SECOND))]
     assert plot(write_bag(folder / 'bag', sample(extra, count=9)), '--csv', 'a.csv').code == 0
     columns = read_csv('a.csv')
-    assert set(columns['v_command_mps']) == {1.0}
-    assert set(columns['omega_command_radps']) == {2.0}
+    applied = np.column_stack([columns['v_command_mps'], columns['omega_command_radps']])
+    assert (applied == (1.0, 2.0)).all()
 
 
 # --- Files
@@ -244,11 +238,6 @@ def test_the_picture_is_beside_a_bag_of_any_name(folder, monkeypatch):
     picture = folder / f'{name}.png'
     assert plot('.') == (0, f'{picture}\n', '')
     assert picture.read_bytes().startswith(b'\x89PNG')
-
-
-def test_the_picture_is_of_the_format_of_its_ending(folder):
-    assert plot(odometry_only(folder / 'bag'), '-o', 'picture.SVG') == (0, 'picture.SVG\n', '')
-    assert (folder / 'picture.SVG').read_bytes().startswith(b'<?xml')
 
 
 @pytest.mark.usefixtures('undrawn')
@@ -326,23 +315,3 @@ def test_paths_are_printed_without_control_characters(bag, tmp_path):
     assert f'{escaped}/a.png exists already' in refused(bag, '-o', place / 'a.png')
     missing = place / 'none' / 'a.png'
     assert f'{escaped}/none/a.png cannot be written: ' in refused(bag, '-o', missing, code=1)
-
-
-def test_a_signal_ends_the_drawing(bag, folder, monkeypatch):
-    class EndedError(Exception):
-        pass
-
-    def end():
-        raise EndedError
-
-    signals = Signals(end)
-    monkeypatch.setattr(run_figure, 'render', lambda *_: os.kill(os.getpid(), signal.SIGHUP))
-    before = {number: signal.getsignal(number) for number in CAUGHT}
-    try:
-        signals.catch()
-        with pytest.raises(EndedError):
-            commands.run('plot_run', bag, '-o', 'run.png', signals=signals)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    assert not list(folder.iterdir())

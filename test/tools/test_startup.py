@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import os
-import signal
 import subprocess
 import sys
 
 import pytest
 
-from diffdrive_jacobian.signals import CAUGHT, Signals
-from diffdrive_jacobian.tools.entry_points import long_lived
+pytestmark = pytest.mark.process
 
 STARTED = """
 import gc, json, os, sys
@@ -71,7 +68,6 @@ def run(*arguments: str, **variables: str) -> str:
     ).stdout
 
 
-@pytest.mark.process
 def test_a_node_starts_with_what_it_needs():
     """What is slow to import would delay its first odometry."""
     code, names, threads, (enabled, frozen) = json.loads(run(STARTED))
@@ -94,7 +90,6 @@ def test_a_node_starts_with_what_it_needs():
     assert frozen > 20_000
 
 
-@pytest.mark.process
 def test_help_imports_nothing_slow_and_a_process_without_stderr_gets_one():
     """And the number of threads that the user has set remains."""
     tools = ('send_goal', 'record_run', 'replay_run', 'watch_run', 'doctor')
@@ -102,32 +97,3 @@ def test_help_imports_nothing_slow_and_a_process_without_stderr_gets_one():
     assert (said, threads) == ('enabled', '3')
     assert 'diffdrive_jacobian.tools.doctor' in modules
     assert not {'numpy', 'rclpy', 'rosbags', 'ruamel.yaml', 'matplotlib', 'rich'} & set(modules)
-
-
-def test_a_collector_that_was_disabled_before_stays_so():
-    gc.disable()
-    try:
-        with long_lived():
-            pass
-        assert not gc.isenabled()
-    finally:
-        gc.enable()
-
-
-def test_a_process_is_ended_once_however_many_signals_come():
-    ended = []
-
-    def end():
-        ended.append(len(ended))
-        os.kill(os.getpid(), signal.SIGHUP)
-
-    before = {number: signal.getsignal(number) for number in CAUGHT}
-    try:
-        signals = Signals(end)
-        signals.catch()
-        with signals.ending_at_once():
-            os.kill(os.getpid(), signal.SIGHUP)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    assert (ended, signals.count) == ([0], 2)
