@@ -10,8 +10,10 @@ import argparse
 import math
 import os
 import re
+import resource
 import shlex
 import subprocess
+import sys
 import sysconfig
 from importlib.metadata import distribution
 from pathlib import Path
@@ -28,6 +30,7 @@ from diffdrive_jacobian.tools import _cli, entry_points
 from diffdrive_jacobian.tools.run_node import parameters_of
 
 READERS = ('calibrate_run', 'plot_run', 'recover_run', 'replay_run', 'verify_run', 'watch_run')
+QUICK = ('--grid', 2, '--starts', 1, '--duration', 1, '--rate', 10)
 FAILING = """
 import sys, types
 from diffdrive_jacobian.tools.entry_points import tools
@@ -294,6 +297,29 @@ def test_output_that_cannot_be_written(folder, command, arguments, unbuffered):
             )
             assert (ended.returncode, ended.stderr) == (1, error)
             assert [one.name for one in folder.iterdir()] == [*arguments[2:]]
+
+
+def test_a_file_that_cannot_be_finished_is_removed_and_does_not_keep_the_other(folder, monkeypatch):
+    monkeypatch.setattr('diffdrive_jacobian.plots.sweep_figure.draw', lambda *_: b'picture')
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (64, before[1]))
+    try:
+        ended = run('sweep_gains', *QUICK, '-o', 'a.png', '--csv', 'a.csv')
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (ended.code, ended.out.splitlines()[0]) == (1, 'a.png')
+    assert ended.err == 'sweep_gains: error: a.csv cannot be written: File too large\n'
+    assert [one.name for one in folder.iterdir()] == ['a.png']
+
+
+@pytest.mark.parametrize(('command', 'arguments'), [('plot_run', (REAL,)), ('sweep_gains', QUICK)])
+def test_without_matplotlib_the_remedy_is_reported(folder, monkeypatch, command, arguments):
+    for name in [name for name in sys.modules if name.split('.')[0] == 'matplotlib']:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
+    message = refused(command, *arguments, '-o', 'a.png')
+    assert "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'" in message
+    assert not list(folder.iterdir())
 
 
 # --- Types of arguments
