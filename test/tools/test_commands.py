@@ -88,6 +88,7 @@ WRONG = {
         '--ros-args -p kp:=fast': "'kp' must be a double (as 1.0), got 'fast'",
         '--ros-args -p qos_overrides./odom.subscription.reliability:=often': 'often',
         '--ros-args -p qos_overrides./odom.subscription.depth:=-3': 'depth',
+        '--ros-args --params-file nowhere.yaml': 'nowhere.yaml',
         '--ros-args --params-file malformed.yaml': 'malformed.yaml',
         '--ros-args -- --bogus': '--bogus',
     },
@@ -139,6 +140,7 @@ WRONG = {
         '--controller offset_point --kp 1 2': 'unrecognized arguments: --kp',
         '--max-velocity 2000': "'linear.x.max_velocity' must be in [0, 1000]",
         '--max-yaw-rate 1e-9': 'limits must be at least 1e-06, got 1e-09',
+        '--params-file other.yaml': 'it has none of virtual_robot, but of /go_to_goal',
         '-o a.jpg': "the picture must end in .png, .svg, .pdf, got 'a.jpg'",
         '--csv a.png': "the table must end in .csv, got 'a.png'",
         '--force': '--force has no effect without --output or --csv',
@@ -186,11 +188,15 @@ def test_help_version_and_wrong_arguments(command, folder):
     version = f'{command} (diffdrive_jacobian) {__version__}\n'
     assert run(command, '--version') == (0, version, '')
     assert refused(command, '--bogus')
-    (folder / 'malformed.yaml').write_text('go_to_goal: [1, 2\n  b: }')
+    files = {
+        'malformed': 'go_to_goal: [1, 2\n  b: }',
+        'other': 'go_to_goal: {ros__parameters: {kp: 1.0}}',
+    }
+    for name, content in files.items():
+        (folder / f'{name}.yaml').write_text(content)
     for arguments, words in WRONG.get(command, {}).items():
         assert words in refused(command, *shlex.split(arguments)), arguments
-    (folder / 'malformed.yaml').unlink()
-    assert not list(folder.iterdir())
+    assert {one.name for one in folder.iterdir()} == {f'{name}.yaml' for name in files}
 
 
 @pytest.mark.process

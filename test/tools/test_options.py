@@ -222,20 +222,22 @@ def test_long_work_is_named_on_a_terminal(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ('matters', 'parameters', 'reported'),
+    ('follow', 'matters', 'parameters', 'reported'),
     [
-        (True, {}, True),
-        (False, {}, False),
-        (True, {'use_goal_heading': True}, False),
-        (True, {'controller': 'pose'}, False),
+        (True, True, {}, True),
+        (False, True, {}, True),
+        (True, False, {}, False),
+        (True, True, {'use_goal_heading': True}, False),
+        (True, True, {'controller': 'pose'}, False),
     ],
 )
-def test_a_controller_that_ignores_the_heading_is_reported(matters, parameters, reported):
+def test_a_controller_that_ignores_the_heading_is_reported(follow, matters, parameters, reported):
     overrides = [Parameter(name, value=value) for name, value in parameters.items()]
     progress = Mock()
     with in_lockstep() as runner:
         runner.add(lambda: GoToGoal(context=runner.context, parameter_overrides=overrides))
-        how = {'heading_matters': matters, 'timeout': 1.0, 'progress': progress}
+        how = {'follow': follow, 'heading_matters': matters, 'timeout': 1.0, 'progress': progress}
         send_goal([1.0, 0.0, 1.5], runner=runner, **how)
     assert progress.heading_ignored.called == reported
-    assert ('no odometry on /odom',) in {call.args for call in progress.waiting.call_args_list}
+    waiting = {call.args for call in progress.waiting.call_args_list}
+    assert (('no odometry on /odom',) in waiting) == follow

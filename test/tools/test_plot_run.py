@@ -18,6 +18,7 @@ from support.runs import RATE, sample
 from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.plots import run_figure
+from diffdrive_jacobian.plots.output_files import create
 from diffdrive_jacobian.plots.run_figure import LABELS, draw, figure, names
 from diffdrive_jacobian.plots.run_table import COLUMNS, decimal_seconds
 
@@ -304,6 +305,15 @@ def test_a_bag_without_odometry_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == [bag]
     with pytest.raises(BagError):
         draw([read_run(bag)], tmp_path / 'a.png')
+
+
+def test_files_are_checked_also_when_they_are_written(run, tmp_path):
+    with pytest.raises(ValueError, match=r'must end in \.png, \.svg, \.pdf'):
+        draw([run], tmp_path / 'a.gif')
+    (tmp_path / 'a.png').touch()
+    for write in (lambda path: draw([run], path), lambda path: create(path, b'x')):
+        with pytest.raises(FileExistsError):
+            write(tmp_path / 'a.png')
 
 
 @pytest.mark.usefixtures('undrawn')

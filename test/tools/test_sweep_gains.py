@@ -157,6 +157,13 @@ def test_means_are_over_those_that_arrived_and_the_fastest_is_one_from_which_all
     assert rows[1:] == [f'{kp},{kv},3,0,,,,,,' for kp in (0.2, 6.0) for kv in (0.1, 3.0)]
 
 
+def test_a_setup_checks_itself():
+    with pytest.raises(ValueError, match="controller must be one of 'go_to_goal', 'offset_point'"):
+        SweepSetup(controller='other')
+    with pytest.raises(ValueError, match="gains must be of kv, offset, those of 'offset_point'"):
+        SweepSetup(controller='offset_point', gains={'kp': 1.0})
+
+
 # --- Files
 
 
@@ -322,6 +329,8 @@ def test_a_fine_grid_has_lines_of_equal_values_and_only_what_lies_in_it_is_marke
     (only,) = legend(coarse)
     assert only.startswith('fastest: kp 6, kv 0.6, ')
     assert not any(panel.texts for panel in maps(coarse).values())
+    # Nothing arrives so soon.
+    assert 'fastest' not in ' '.join(legend(figure(sweep(replace(SMALL, grid=2, duration=0.01)))))
     fine = figure(sweep(replace(SMALL, grid=sweep_figure.CONTOUR_GRID, starts=1)))
     for lined, plain in zip(maps(fine).values(), maps(coarse).values(), strict=True):
         assert len(lined.collections) > len(plain.collections)
