@@ -195,6 +195,20 @@ def test_goals_and_their_state():
     assert goal.shown()['state'] == 'succeeded'
 
 
+def test_goals_that_are_replaced_or_refused_leave_the_others():
+    goal = GoalProgress()
+    goal.sent(at(1.0), (1, 0))
+    goal.reported(GoalState.EXECUTING, (1, 0))
+    goal.sent(at(2.0), (2, 0))
+    goal.reported(GoalState.CANCELED, (1, 0))
+    goal.reported(GoalState.ACCEPTED, (2, 0))
+    assert goal.active
+    np.testing.assert_array_equal(goal.goals, at(2.0))
+    goal.sent(at(9.0), (3, 0))
+    goal.reported(GoalState.ABORTED, (3, 0))
+    np.testing.assert_array_equal(goal.goals, at(2.0))
+
+
 # --- Numbers
 
 
