@@ -298,7 +298,7 @@ def test_maps_show_the_means_with_units():
         np.testing.assert_array_equal(values.compressed(), swept.mean(measure)[swept.complete])
         # The cell of kp is around it.
         edges = mesh.get_coordinates()[0, :, 0]
-        assert edges[1:-1] == pytest.approx((swept.x[1:] + swept.x[:-1]) / 2.0)
+        np.testing.assert_allclose(edges[1:-1], (swept.x[1:] + swept.x[:-1]) / 2.0)
         assert panel.patch.get_hatch()
     title = made._suptitle.get_text()
     for word in ('go_to_goal', '3 starts', '2 m', '10 Hz', 'limits: none', '0.02 m'):
