@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import itertools
 import json
 import os
@@ -174,11 +173,6 @@ class Browser:
         """Send one event of a key: Down or Up."""
         self.call('Input.dispatchKeyEvent', type=f'key{kind}', code=code, key=code.removeprefix('Key'),
                   windowsVirtualKeyCode=KEYS[code])  # fmt: skip
-
-    def screenshot(self, path, *, whole=False):
-        """Write a picture of the page."""
-        picture = self.call('Page.captureScreenshot', format='png', captureBeyondViewport=whole)
-        Path(path).write_bytes(base64.b64decode(picture['data']))
 
     def close(self):
         """End the browser."""

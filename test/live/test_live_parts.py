@@ -12,7 +12,17 @@ import pytest
 from diffdrive_jacobian.control import KP, KV, Arrival, circle_path
 from diffdrive_jacobian.kinematics import diff_drive, se2
 from diffdrive_jacobian.live import robot_state, settings
-from diffdrive_jacobian.live.commands import Pause, SetSpeed, Step
+from diffdrive_jacobian.live.commands import (
+    CommandError,
+    DriveByHand,
+    Pause,
+    Seek,
+    SendGoal,
+    SetParameter,
+    SetSpeed,
+    Step,
+    parse,
+)
 from diffdrive_jacobian.live.hand import CANCEL_PATIENCE, DEAD_MAN, Act, HandDriving
 from diffdrive_jacobian.live.node import Pacing
 from diffdrive_jacobian.live.quantities import chain, errors, region, rounded
@@ -20,6 +30,57 @@ from diffdrive_jacobian.live.robot_state import SPACING, GoalProgress, RobotStat
 from diffdrive_jacobian.live.server import page_files
 from diffdrive_jacobian.live.session import MAX_COMMANDS, MAX_NOTICES, Session, Snapshot
 from diffdrive_jacobian.messages.goal_status import GoalState
+
+# --- Commands of the page
+
+GOAL = {'do': 'goal', 'robot': '/', 'x': 1, 'y': -2.5, 'theta': None, 'append': False}
+DRIVE = {'do': 'drive', 'robot': '/a', 'v': 0.2, 'omega': -1.0}
+SET = {'do': 'set', 'robot': '/', 'parameter': 'c/kp', 'value': 3}
+
+
+def test_commands_are_parsed():
+    for content, command in (
+        (GOAL, SendGoal('/', 1.0, -2.5, None, append=False)),
+        ({**GOAL, 'theta': 3.0, 'append': True}, SendGoal('/', 1.0, -2.5, 3.0, append=True)),
+        (DRIVE, DriveByHand('/a', 0.2, -1.0)),
+        ({'do': 'pause', 'paused': True}, Pause(paused=True)),
+        ({'do': 'step'}, Step()),
+        ({'do': 'speed', 'speed': 5}, SetSpeed(5.0)),
+        ({'do': 'seek', 'time': 0}, Seek(0.0)),
+        ({**SET, 'value': None}, SetParameter('/', 'c/kp', None)),
+        (SET, SetParameter('/', 'c/kp', 3.0)),
+    ):
+        assert parse(json.dumps(content)) == command
+
+
+@pytest.mark.parametrize(
+    ('content', 'words'),
+    [
+        (b'{}', 'must be text'),
+        ('[' * 3000, 'must be JSON'),
+        ([], 'must be a JSON object'),
+        ({'do': 'shutdown'}, "do must be one of .*, got 'shutdown'"),
+        ({**DRIVE, 'more': 1}, 'drive must have the keys robot, v, omega'),
+        ({**DRIVE, 'v': True}, 'v must be a number'),
+        ({**DRIVE, 'v': 10**400}, r'v must be in \[-1000, 1000\], got 1000000'),
+        ({**DRIVE, 'v': math.nan}, 'must be JSON'),
+        (json.dumps(DRIVE).replace('0.2', '1e999'), r'v must be in \[-1000, 1000\], got inf'),
+        ({**DRIVE, 'robot': 7}, 'robot must be a text'),
+        ({**DRIVE, 'robot': 'x' * 300}, 'at most 256 printable characters'),
+        ({**SET, 'parameter': 'a\ud800'}, 'parameter must be a text of at most 256 printable'),
+        ({**SET, 'value': 'a\x1b'}, 'value must be a text of at most 256 printable'),
+        ({**SET, 'value': [1]}, 'value must be'),
+        ({**GOAL, 'append': 0}, 'append must be True or False, got 0'),
+        ({**GOAL, 'theta': 99.0}, r'theta must be in \[-6.28319, 6.28319\] rad, got 99.0'),
+        ({**GOAL, 'x': 1e7}, r'x must be in \[-1e\+06, 1e\+06\] m, got 10000000.0'),
+        ({'do': 'speed', 'speed': 0}, r'speed must be in \[0.01, 1000\], got 0'),
+    ],
+)
+def test_other_commands_are_refused(content, words):
+    with pytest.raises(CommandError, match=words) as caught:
+        parse(content if isinstance(content, str | bytes) else json.dumps(content))
+    assert str(caught.value).isprintable()
+
 
 # --- Driving by hand
 
@@ -61,24 +122,20 @@ def test_one_page_drives_at_a_time_until_it_releases(hand):
     assert not hand.command(2, (0.9, 0.0), now=10.01)
     hand.release(2)
     assert hand.twist == (0.2, 0.0)
-    assert ask(hand, 10.05) is Act.PUBLISH
     hand.release(1)
     assert ask(hand, 10.06) is Act.STOP
     assert hand.command(2, (0.9, 0.0), now=10.3)
 
 
-def test_an_active_goal_is_canceled_before_anything_is_driven(hand):
+def test_nothing_is_driven_before_an_active_goal_is_canceled(hand):
     assert ask(hand, 10.0, goal_active=True) is Act.CANCEL_GOAL
-    hand.command(1, (0.2, 0.0), now=10.1)
     assert ask(hand, 10.1, goal_active=True) is Act.NOTHING
     assert ask(hand, 10.2) is Act.PUBLISH
-
-
-def test_nothing_is_driven_if_the_goal_is_not_canceled(hand):
-    acts, waits = [], round(CANCEL_PATIENCE / 0.1)
+    # It is not canceled.
+    hand, acts, waits = HandDriving(), [], round(CANCEL_PATIENCE / 0.1)
     for step in range(2 * waits):
         now = 10.0 + 0.1001 * step
-        if hand.page is not None:
+        if step < waits or hand.page is not None:
             hand.command(1, (0.2, 0.0), now=now)
         acts.append(ask(hand, now, goal_active=True))
     nothing = [Act.NOTHING] * (waits - 1)
@@ -98,10 +155,8 @@ def test_time_passes_at_the_speed_that_was_chosen():
     assert not pacing.may_advance(5.04, now=100.03)
     assert pacing.may_advance(5.04, now=100.051)
     # A machine that was busy does not race afterwards.
-    pacing = Pacing()
-    assert pacing.may_advance(0.0, now=0.0)
-    assert pacing.may_advance(0.02, now=9.0)
-    assert not pacing.may_advance(0.04, now=9.01)
+    assert pacing.may_advance(5.06, now=109.0)
+    assert not pacing.may_advance(5.08, now=109.01)
 
 
 def test_pause_and_steps():
@@ -139,48 +194,19 @@ def test_goals_and_their_state():
     assert goal.current is None
     assert goal.shown()['state'] == 'succeeded'
 
-    # A status that overtakes its goal.
+
+def test_goals_that_are_replaced_or_refused_leave_the_others():
     goal = GoalProgress()
-    goal.reported(GoalState.EXECUTING, (2, 0))
-    assert goal.active
-    assert goal.current is None
-    goal.sent(at(1.0), (2, 0))
-    np.testing.assert_array_equal(goal.current, [1.0, 0.0, 0.0])
-
-
-def test_a_goal_that_is_replaced_and_one_that_is_refused():
-    goal, second = GoalProgress(), at(2.0)
     goal.sent(at(1.0), (1, 0))
     goal.reported(GoalState.EXECUTING, (1, 0))
-    goal.sent(second, (2, 0))
+    goal.sent(at(2.0), (2, 0))
     goal.reported(GoalState.CANCELED, (1, 0))
     goal.reported(GoalState.ACCEPTED, (2, 0))
     assert goal.active
-    np.testing.assert_array_equal(goal.goals, second)
+    np.testing.assert_array_equal(goal.goals, at(2.0))
     goal.sent(at(9.0), (3, 0))
     goal.reported(GoalState.ABORTED, (3, 0))
-    goal.reported(GoalState.EXECUTING, (2, 0))
-    np.testing.assert_array_equal(goal.goals, second)
-
-
-def test_the_end_of_each_goal_is_reported_once():
-    goal = GoalProgress()
-    goal.sent(at(1.0), (1, 0))
-
-    def ends(state, stamp):
-        changed = goal.reported(state, stamp)
-        return changed is not None and changed.fate.is_end
-
-    assert not ends(GoalState.EXECUTING, (1, 0))
-    assert ends(GoalState.SUCCEEDED, (1, 0))
-    assert not ends(GoalState.SUCCEEDED, (1, 0))
-    goal.sent(at(2.0), (2, 0))
-    assert ends(GoalState.ABORTED, (2, 0))
-    goal.sent(at(3.0), (3, 0))
-    assert not ends(GoalState.ACCEPTED, (3, 0))
-    goal.sent(at(4.0), (4, 0))
-    assert not ends(GoalState.CANCELED, (3, 0))
-    assert ends(GoalState.CANCELED, (4, 0))
+    np.testing.assert_array_equal(goal.goals, at(2.0))
 
 
 # --- Numbers
@@ -223,40 +249,82 @@ def test_errors_and_numbers_that_are_short_and_finite():
     assert rounded([1.23456789, math.nan, (np.float64(2.0), 3)]) == [1.23457, None, [2.0, 3]]
 
 
-# --- Bounds
+# --- States of a robot
 
 
-@pytest.fixture
-def short(monkeypatch):
-    """Paths have few points."""
-    monkeypatch.setattr(robot_state, 'MAX_POINTS', 600)
-    return 600
-
-
-def test_a_path_is_bounded_and_interrupted_by_jumps(short):
-    trail = Trail()
-    for step in range(3 * short):
-        trail = trail.extended(1.1 * SPACING * step, 0.0)
-    assert len(trail.points) <= short
+def test_a_path_is_bounded_and_ends_where_the_robot_is(monkeypatch):
+    """Also of odometry that jumps after every few messages."""
+    monkeypatch.setattr(robot_state, 'MAX_POINTS', 300)
+    for piece in (1, 3, 10**9):
+        trail, renewed = Trail(), 0
+        for step in range(3600):
+            x = 1.1 * SPACING * step + 5.0 * (step // piece)
+            before, trail = trail, trail.extended(x, 0.0)
+            renewed += trail is not before
+            assert len(trail.points) <= 300
+            assert trail.points[-1][0] == pytest.approx(x, abs=0.5)
+        # A new path is sent to the page as a whole.
+        assert renewed < 60
     assert trail.points[0] == (0.0, 0.0)
-    assert trail.points[-1][0] == pytest.approx(1.1 * SPACING * (3 * short - 1), abs=0.1)
     trail = trail.extended(0.0, 0.0)
     assert trail.points[-2:] == [None, (0.0, 0.0)]
     assert len(trail.extended(0.0, SPACING / 2).points) == len(trail.points)
 
 
-@pytest.mark.parametrize('piece', [1, 2, 3, 20])
-def test_a_path_of_many_jumps_goes_on(short, piece):
-    """The longest that odometry can jump about; what is shown ends where the robot is."""
-    trail, renewed = Trail(), 0
-    for step in range(12 * short):
-        x = 1.1 * SPACING * step + 5.0 * (step // piece)
-        before, trail = trail, trail.extended(x, 0.0)
-        renewed += trail is not before
-        assert len(trail.points) <= short
-        assert trail.points[-1][0] == pytest.approx(x, abs=0.5)
-    # A new path is sent to the page as a whole.
-    assert renewed < 60
+def test_the_path_is_interrupted_where_a_robot_is_placed():
+    state = RobotState('/')
+    for x in (0.0, 0.02, 0.04):
+        state.moved(x, np.array([x, 0.0, 0.0]), (1.0, 0.0), None)
+    state.interrupt()
+    # One message more is from before.
+    for time, x in ((0.06, 0.06), (0.08, 0.2), (0.1, 0.22)):
+        state.moved(time, np.array([x, 0.0, 0.0]), (1.0, 0.0), None)
+    abscissas = [point and point[0] for point in state.trail.points]
+    assert abscissas == [0.0, 0.02, 0.04, 0.06, None, 0.2, 0.22]
+
+
+def test_parameters_of_any_node_may_be_anything():
+    state = RobotState('/')
+    state.moved(1.0, np.array([1.0, 2.0, 0.5]), (0.3, 0.1), None)
+    state.goal.sent(at(2.0, 2.0), (1, 0))
+    state.goal.reported(GoalState.EXECUTING, (1, 0))
+    usual = state.shown(age=0.0, by_hand=False)
+    for value in (math.nan, math.inf, -1.0, 0.0, 1e-300, 1e300, 'x', None, True, [1.0]):
+        geometry = ('wheel_radius', 'wheel_separation', 'left_wheel_name')
+        state.robot_values = dict.fromkeys(geometry, value)
+        names = ('kp', 'kv', 'offset', 'xy_goal_tolerance', 'use_goal_heading')
+        for controller in ('go_to_goal', 'pose', 'offset_point', value):
+            state.controller_values = {**dict.fromkeys(names, value), 'controller': controller}
+            shown = state.shown(age=0.0, by_hand=False)
+            json.dumps(shown, allow_nan=False)
+            assert shown['geometry'] == usual['geometry']
+
+
+def test_a_planned_path_is_shown_with_its_errors():
+    state = RobotState('/')
+    state.goal.sent(circle_path(1.0), (1, 0))
+    state.goal.reported(GoalState.EXECUTING, (1, 0))
+    state.controller_values = {'controller': 'go_to_goal', 'path_controller': 'kanayama'}
+    for x in (0.0, 0.1):
+        state.moved(x, np.array([x, -0.05, 0.2]), (1.0, 0.0), None)
+    shown = json.loads(json.dumps(state.shown(age=0.0, by_hand=False), allow_nan=False))
+    assert (shown['law']['name'], shown['bearing_error']) == ('kanayama', None)
+    away = math.hypot(0.1, 1.05) - 1.0
+    assert shown['across'] == pytest.approx(-away, abs=1e-4)
+    passed = math.atan2(0.1, 1.05)
+    assert shown['path_heading_error'] == pytest.approx(0.2 - passed, abs=1e-4)
+    assert shown['distance'] == pytest.approx(2.0 * math.pi - passed, abs=2e-3)
+    places = np.array(shown['goal']['path'])
+    np.testing.assert_allclose(np.hypot(places[:, 0], places[:, 1] - 1.0), 1.0, atol=1e-3)
+    assert len(shown['goal']['goals']) == 1
+    state.goal.sent(at(2.0, 2.0), (2, 0))
+    state.goal.reported(GoalState.EXECUTING, (2, 0))
+    shown = state.shown(age=0.0, by_hand=False)
+    assert (shown['across'], shown['goal'].get('path')) == (None, None)
+    assert shown['law']['name'] == 'go_to_goal'
+
+
+# --- Sessions
 
 
 def test_a_page_receives_only_what_is_new():
@@ -275,7 +343,7 @@ def test_a_page_receives_only_what_is_new():
     assert 'fixed' not in second
     assert second['paths'] == {'/': {'new': False, 'points': [(1.0, 0.0)]}}
     assert [notice['text'] for notice in second['notices']] == ['something']
-    assert 'notices' not in (session.enter().frame(session))
+    assert 'notices' not in session.enter().frame(session)
 
 
 def test_commands_and_notices_are_bounded():
@@ -321,20 +389,6 @@ def test_the_page_loads_nothing_from_elsewhere():
         assert not re.search(r'https?:|//\w+\.\w|@import|url\(', text), name
 
 
-def test_modules_and_elements_that_are_used_exist():
-    texts = {name: content.decode() for name, (_, content) in page_files().items()}
-    ids = set(re.findall(r'id="([\w-]+)"', texts['index.html']))
-    for name, text in texts.items():
-        for used in re.findall(r"byId\('([\w-]+)'\)", text):
-            assert used in ids, (name, used)
-        for module in re.findall(r"from '\./(\w+\.js)'", text):
-            assert module in texts, (name, module)
-        if name.endswith('.js') and name != 'main.js':
-            assert any(f"'./{name}'" in other for other in texts.values()), name
-    # The content security policy forbids inline scripts and styles.
-    assert not re.search(r'<script>|style=|onclick=', texts['index.html'])
-
-
 def test_every_control_has_a_name():
     html = page_files()['index.html'][1].decode()
     for tag in re.findall(r'<(?:button|canvas|select|input)[^>]*>[^<]*', html):
@@ -342,69 +396,3 @@ def test_every_control_has_a_name():
         labelled = 'aria-label' in tag or any(letter.isalpha() for letter in text)
         within_label = re.search(rf'<label>[^\n]*{re.escape(tag)}', html)
         assert labelled or within_label, tag
-
-
-def test_installed_controllers_are_looked_for_once(monkeypatch):
-    """It takes many milliseconds, and the page is served 30 times a second."""
-    looked = []
-    monkeypatch.setattr(settings, 'controller_names', lambda: looked.append(1) or ['a'])
-    settings._controllers.cache_clear()
-    for _ in range(5):
-        settings.shown({'controller': {'controller': 'a'}}, ())
-    settings._controllers.cache_clear()
-    assert len(looked) == 1
-
-
-ROBOT_NAMES = ('wheel_radius', 'wheel_separation', 'left_wheel_name')
-
-
-def test_parameters_of_any_node_may_be_anything():
-    state = RobotState('/')
-    state.moved(1.0, np.array([1.0, 2.0, 0.5]), (0.3, 0.1), None)
-    state.goal.sent(at(2.0, 2.0), (1, 0))
-    state.goal.reported(GoalState.EXECUTING, (1, 0))
-    usual = state.shown(age=0.0, by_hand=False)
-    for value in (math.nan, math.inf, -1.0, 0.0, 1e-300, 1e300, 'x', None, True, [1.0]):
-        state.robot_values = dict.fromkeys(ROBOT_NAMES, value)
-        names = ('kp', 'kv', 'offset', 'xy_goal_tolerance', 'use_goal_heading')
-        for controller in ('go_to_goal', 'pose', 'offset_point', value):
-            state.controller_values = {**dict.fromkeys(names, value), 'controller': controller}
-            shown = state.shown(age=0.0, by_hand=False)
-            json.dumps(shown, allow_nan=False)
-            assert shown['geometry'] == usual['geometry']
-
-
-def test_a_planned_path_is_shown_with_its_errors():
-    state = RobotState('/')
-    state.goal.sent(circle_path(1.0), (1, 0))
-    state.goal.reported(GoalState.EXECUTING, (1, 0))
-    state.controller_values = {'controller': 'go_to_goal', 'path_controller': 'kanayama'}
-    for x in (0.0, 0.1):
-        state.moved(x, np.array([x, -0.05, 0.2]), (1.0, 0.0), None)
-    shown = json.loads(json.dumps(state.shown(age=0.0, by_hand=False), allow_nan=False))
-    assert (shown['law']['name'], shown['bearing_error']) == ('kanayama', None)
-    away = math.hypot(0.1, 1.05) - 1.0
-    assert shown['across'] == pytest.approx(-away, abs=1e-4)
-    passed = math.atan2(0.1, 1.05)
-    assert shown['path_heading_error'] == pytest.approx(0.2 - passed, abs=1e-4)
-    assert shown['distance'] == pytest.approx(2.0 * math.pi - passed, abs=2e-3)
-    places = np.array(shown['goal']['path'])
-    np.testing.assert_allclose(np.hypot(places[:, 0], places[:, 1] - 1.0), 1.0, atol=1e-3)
-    assert len(shown['goal']['goals']) == 1
-    state.goal.sent(at(2.0, 2.0), (2, 0))
-    state.goal.reported(GoalState.EXECUTING, (2, 0))
-    shown = state.shown(age=0.0, by_hand=False)
-    assert (shown['across'], shown['goal'].get('path')) == (None, None)
-    assert shown['law']['name'] == 'go_to_goal'
-
-
-def test_the_path_is_interrupted_where_a_robot_is_placed():
-    state = RobotState('/')
-    for x in (0.0, 0.02, 0.04):
-        state.moved(x, np.array([x, 0.0, 0.0]), (1.0, 0.0), None)
-    state.interrupt()
-    # One message more is from before.
-    for time, x in ((0.06, 0.06), (0.08, 0.2), (0.1, 0.22)):
-        state.moved(time, np.array([x, 0.0, 0.0]), (1.0, 0.0), None)
-    abscissas = [point and point[0] for point in state.trail.points]
-    assert abscissas == [0.0, 0.02, 0.04, 0.06, None, 0.2, 0.22]

@@ -7,7 +7,6 @@ import http.client
 import json
 import select
 import socket
-import threading
 import time
 
 import pytest
@@ -83,20 +82,12 @@ def test_the_page_with_its_token(server):
 
 
 def test_without_the_token_nothing_is_served(server):
-    for path in (
-        '/',
-        '/index.html',
-        '/x/main.js',
-        '/%00/',
-        '//',
-        '/../',
-        '/open/',
-        '/open/x',
-        '/socket',
-    ):
+    for path in ('/', '/index.html', '/x/main.js', '/%00/', '//', '/../', '/open/x', '/socket'):
         status, headers, body = get(server, path)
         assert (status, b'token' in body) == (403, True), path
         assert 'Content-Security-Policy' in headers
+    for path in ('/socket', '/wrong/socket', '/', '/open/x'):
+        assert refused(server, path=path), path
 
 
 def test_only_the_files_of_the_page_are_served(server):
@@ -119,10 +110,7 @@ def test_another_name_of_this_machine_is_refused(server):
     for host in ('evil.example', 'evil.example:80', '127.0.0.1.evil.example', '10.0.0.1'):
         assert get(server, path, Host=host)[0] == 403, host
         assert refused(server, host=host, origin=f'http://{host}')
-
-
-def test_localhost_and_a_forwarded_port(server):
-    path = f'/{server.access.token}/'
+    # A forwarded port.
     for host in (f'localhost:{server.port}', 'localhost:9000', '127.0.0.1:9000'):
         assert get(server, path, Host=host)[0] == 200
         with page(server, host=host, origin=f'http://{host}'):
@@ -139,11 +127,6 @@ def test_a_page_of_another_origin_cannot_connect(server):
     ):
         assert refused(server, origin=origin), origin
         assert get(server, f'/{server.access.token}/', Origin=origin)[0] == 403, origin
-
-
-def test_without_the_token_no_page_connects(server):
-    for path in ('/socket', '/wrong/socket', '/', '/open/x'):
-        assert refused(server, path=path), path
 
 
 def test_the_ticket_opens_the_page_once(server):
@@ -215,14 +198,12 @@ def test_malformed_commands_are_refused_and_then_disconnect(server):
     assert session_of(server).take_commands() == []
 
 
-def test_large_messages_disconnect(server):
+def test_large_messages_and_too_many_pages_are_disconnected(server):
     for message in ('x' * 5000, b'\x00' * 100_000):
         with page(server) as bad:
             bad.send(message)
             assert closed(bad) == 1009
-
-
-def test_pages_are_limited(server):
+    until(lambda: not session_of(server).watched, 'the pages are gone')
     with contextlib.ExitStack() as stack:
         for _ in range(MAX_PAGES):
             stack.enter_context(page(server))
@@ -245,14 +226,10 @@ def test_what_is_no_http_is_disconnected(server):
     assert get(server, f'/{server.access.token}/')[0] == 200
 
 
-@pytest.fixture
-def few_strangers(monkeypatch):
-    """Let a server disconnect others because they are too many, not because they are silent."""
+def test_connections_that_ask_for_nothing_do_not_use_up_descriptors(monkeypatch, server):
+    # Others are disconnected because they are too many, not because they are silent.
     monkeypatch.setattr(live_server, 'MAX_STRANGERS', 16)
     monkeypatch.setattr(live_server, 'PATIENCE', 1e3)
-
-
-def test_connections_that_ask_for_nothing_do_not_use_up_descriptors(few_strangers, server):
     with page(server) as first, contextlib.ExitStack() as stack:
         idle = [
             stack.enter_context(socket.create_connection(('127.0.0.1', server.port), timeout=20))
@@ -279,24 +256,14 @@ def test_a_page_that_does_not_read_delays_nobody(server):
             'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n'.encode()
         )
         until(lambda: len(session._pages) == 2, 'both pages')
-        stop = threading.Event()
-        spent = []
-
-        def store():
-            before = time.thread_time()
-            for number in range(200):
-                session.store(Snapshot(robots=big, world={'number': number}))
-            spent.append(time.thread_time() - before)
-            stop.set()
-
-        thread = threading.Thread(target=store)
-        thread.start()
-        numbers = [json.loads(reading.recv(timeout=20))['world'].get('number', 0)]
+        before = time.thread_time()
+        for number in range(200):
+            session.store(Snapshot(robots=big, world={'number': number}))
+        assert time.thread_time() - before < 0.1
+        numbers = [0]
         while numbers[-1] != 199:
             numbers.append(json.loads(reading.recv(timeout=20))['world'].get('number', 0))
-        thread.join()
         assert numbers == sorted(numbers)
-        assert spent[0] < 0.1
         raw.close()
 
 
@@ -308,7 +275,3 @@ def test_it_ends_while_pages_are_open():
         assert closed(open_page) == 1001
     with pytest.raises(OSError, match='refused'):
         socket.create_connection(('127.0.0.1', server.port), timeout=5)
-
-
-def test_it_can_be_closed_at_once():
-    LiveServer(Session()).close()

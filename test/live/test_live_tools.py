@@ -99,8 +99,7 @@ def test_drive_to_live_in_real_time(world):
     with opened(drive) as page:
         until(lambda: robots(page).get('/', {}).get('goal', {}).get('state') == 'succeeded', 'arrives')
     drive.signal(signal.SIGINT)
-    assert drive.exit() == 0
-    assert drive.stderr == ''
+    assert (drive.exit(), drive.stderr) == (0, '')
 
 
 # --- Arguments

@@ -6,7 +6,6 @@ import errno
 import math
 import os
 import re
-import signal
 import threading
 from functools import partial
 from pathlib import Path
@@ -17,13 +16,11 @@ import pytest
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from support import commands
-from support.processes import open_world
 
 from diffdrive_jacobian.bags import journal, read_run
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.drives import (
     DriveError,
-    Outcome,
     drive,
     in_lockstep,
     in_real_time,
@@ -34,137 +31,113 @@ from diffdrive_jacobian.lockstep import runner as lockstep_runner
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.parameters.nodes import CONTROLLERS
 from diffdrive_jacobian.recording.recording import Recording
-from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.tools import _output
 
 QUICK = {'kp': 12.0, 'kv': 3.0}
 # Integers are taken for doubles.
 QUICK_ARGUMENTS = ('--ros-args', '-p', 'kp:=12', '-p', 'kv:=3')
-CONFIGS = sorted((Path(__file__).parents[2] / 'config').glob('*.yaml'))
+CONFIG = Path(__file__).parents[2] / 'config'
 RECORD = ('--no-plot', '-o', 'bag')
-CRAWL = (50, 0, '--timeout', '1e6', '--no-record', '--ros-args', '-p', 'linear.x.max_velocity:=0.001')
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
-    """Record to a temporary directory."""
+def folder(tmp_path, monkeypatch):
+    """Where bags are recorded."""
     monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 # --- From Python
 
 
-def test_a_drive_from_python_returns_the_outcome():
+def test_a_drive_returns_the_outcome_and_reports_its_progress():
     progress = Mock()
-    outcome = drive([[0.5, 0.0], [0.5, 0.5]], lockstep=True, parameters=QUICK, progress=progress)
-    assert isinstance(outcome, Outcome)
+    outcome = drive([[0.2, 0.0], [0.2, 0.2]], lockstep=True, parameters=QUICK, progress=progress)
     assert outcome.arrived
     assert not outcome.interrupted
     assert outcome.distance <= 0.02
-    assert math.dist(outcome.pose[:2], (0.5, 0.5)) == pytest.approx(outcome.distance)
+    assert math.dist(outcome.pose[:2], (0.2, 0.2)) == pytest.approx(outcome.distance)
     names = ['/virtual_robot', '/wheel_bridge', '/go_to_goal', '/drive_to']
     progress.nodes_created.assert_called_once_with(names)
     states = [call.args for call in progress.driving.call_args_list]
     seconds, indices, distances, _ = zip(*states, strict=True)
     assert list(seconds) == sorted(seconds)
     assert sorted(set(indices)) == [0, 1]
-    assert distances[0] == pytest.approx(0.5)
+    assert distances[0] == pytest.approx(0.2)
 
 
 def test_drives_in_lockstep_are_reproducible_and_recorded_where_the_caller_says():
+    parameters = {'controller': 'offset_point', 'offset': 0.2, **QUICK}
     recording = Recording(Path('bag'), 'mcap', lossless=True)
-    first = drive([[0.3, 0.2]], lockstep=True, parameters=QUICK, recording=recording)
+    first = drive([[0.3, 0.1]], lockstep=True, parameters=parameters, recording=recording)
     recording.finish()
-    second = drive([[0.3, 0.2]], lockstep=True, parameters=QUICK)
+    second = drive([[0.3, 0.1]], lockstep=True, parameters=parameters)
     assert first.pose.tobytes() == second.pose.tobytes()
     assert (first.seconds, first.distance) == (second.seconds, second.distance)
     np.testing.assert_array_equal(read_run(Path('bag')).odometry.values[-1, :3], first.pose)
-
-
-def test_distance_is_that_of_the_driven_point():
-    parameters = {'controller': 'offset_point', 'offset': 0.2, **QUICK}
-    outcome = drive([[0.5, 0.0]], lockstep=True, parameters=parameters)
-    x, y, theta = outcome.pose
+    # The distance is that of the driven point.
+    x, y, theta = first.pose
     point = (x + 0.2 * math.cos(theta), y + 0.2 * math.sin(theta))
-    assert outcome.offset == 0.2
-    assert outcome.distance == pytest.approx(math.dist(point, (0.5, 0.0)))
-    assert outcome.distance <= 0.02
+    assert first.distance == pytest.approx(math.dist(point, (0.3, 0.1)))
+    assert first.distance <= 0.02
 
 
-def test_a_signal_ends_a_drive():
-    signals = Signals()
-    signals.count = 1
-    assert drive([[50.0, 0.0]], lockstep=True, signals=signals).interrupted
+def test_invalid_arguments_are_named():
+    for options, error, words in (
+        ({'parameters': {'kp': -1.0}}, UserError, "'kp' must be in"),
+        ({'ros_arguments': ['--ros-args', '--no']}, UserError, 'unknown ROS arguments'),
+        ({'isolated': False}, ValueError, 'in lockstep is always isolated'),
+        ({'timeout': math.nan}, ValueError, 'timeout must be positive'),
+        ({'goals': [1.0, 1.0]}, ValueError, r'must have shape \(n, 2\)'),
+    ):
+        with pytest.raises(error, match=words):
+            drive(**{'goals': [[1.0, 1.0]], 'lockstep': True, **options})
+    with in_lockstep() as runner:
+        with pytest.raises(ValueError, match=r'goals must have shape \(n, 3\)'):
+            drive(np.zeros((0, 3)), runner=runner)
+        with pytest.raises(ValueError, match='are those of the runner'):
+            drive([[1.0, 1.0]], runner=runner, lockstep=True)
+    for name in ('timeout', 'patience'):
+        with pytest.raises(ValueError, match=f'{name} must be positive'):
+            send_goal([1.0, 1.0, 0.0], **{name: -1.0})
 
 
-def test_errors_are_typed(monkeypatch):
-    with pytest.raises(UserError, match="'kp' must be in"):
-        drive([[1.0, 1.0]], lockstep=True, parameters={'kp': -1.0})
-    with pytest.raises(UserError, match='unknown ROS arguments'):
-        drive([[1.0, 1.0]], lockstep=True, ros_arguments=['--ros-args', '--no-such-option'])
-    with pytest.raises(ValueError, match='a drive in lockstep is always isolated'):
-        drive([[1.0, 1.0]], lockstep=True, isolated=False)
-    with pytest.raises(ValueError, match=r'must have shape \(n, 2\)'):
-        drive([1.0, 1.0], lockstep=True)
-    with in_lockstep() as runner, pytest.raises(ValueError, match=r'goals must have shape \(n, 3\)'):
-        drive(np.zeros((0, 3)), runner=runner)
-    with in_lockstep() as runner, pytest.raises(ValueError, match='are those of the runner'):
-        drive([[1.0, 1.0]], runner=runner, lockstep=True)
-
+def test_a_node_that_sleeps_on_its_clock_is_an_error(monkeypatch):
     def sleep(self, *_):
-        self.get_clock().sleep_until(self.get_clock().now() + GoToGoal.LONG)
+        self.get_clock().sleep_until(self.get_clock().now() + Duration(seconds=10))
 
-    monkeypatch.setattr(GoToGoal, 'LONG', Duration(seconds=10), raising=False)
     monkeypatch.setattr(GoToGoal, '_on_odometry', sleep)
     with pytest.raises(DriveError, match='sleeps on its clock'):
         drive([[1.0, 1.0]], lockstep=True)
 
 
-@pytest.mark.parametrize('timeout', [-1.0, 0.0, math.nan])
-def test_times_are_positive(timeout):
-    with pytest.raises(ValueError, match='timeout must be positive'):
-        drive([[1.0, 1.0]], lockstep=True, timeout=timeout)
-    with pytest.raises(ValueError, match='timeout must be positive'):
-        send_goal([1.0, 1.0, 0.0], timeout=timeout)
-    with pytest.raises(ValueError, match='patience must be positive'):
-        send_goal([1.0, 1.0, 0.0], patience=timeout)
-
-
-def test_goals_are_sent_one_after_the_other_in_one_runner():
-    for run in (in_lockstep, in_real_time):
-        with run() as runner:
-            nodes = [
-                runner.add(lambda node=node: node(context=runner.context))
-                for node in (VirtualRobot, GoToGoal)
-            ]
-            nodes[1].set_parameters([Parameter('kv', value=4.0), Parameter('kp', value=12.0)])
-            for x in (0.2, 0.4):
-                assert send_goal([x, 0.0, 0.0], runner=runner).arrived
-                left = partial(nodes[0].count_publishers, '/goal_pose')
-                assert runner.spin(lambda left=left: not left(), timeout=5.0)
-
-
-def test_an_error_of_the_progress_cancels_the_goal():
-    progress = Mock(**{'driving.side_effect': BrokenPipeError})
-    with in_lockstep() as runner:
-        robot = runner.add(lambda: VirtualRobot(context=runner.context))
+@pytest.mark.parametrize('run', [in_lockstep, in_real_time])
+def test_goals_are_sent_one_after_the_other_in_one_runner(run):
+    with run() as runner:
+        runner.add(lambda: VirtualRobot(context=runner.context))
         controller = runner.add(lambda: GoToGoal(context=runner.context))
-        with pytest.raises(BrokenPipeError):
-            send_goal([5.0, 0.0, 0.0], runner=runner, progress=progress)
-        assert controller.waypoint is None
-        assert robot.get_publishers_info_by_topic('/goal_pose') == []
+        controller.set_parameters([Parameter('kv', value=4.0), Parameter('kp', value=12.0)])
+        for x in (0.1, 0.2):
+            assert send_goal([x, 0.0, 0.0], runner=runner).arrived
+            assert runner.spin(lambda: not controller.count_publishers('/goal_pose'), timeout=5.0)
 
 
-def test_a_goal_is_sent_where_no_timer_runs():
+def test_a_goal_that_is_not_reached_is_canceled_also_where_no_timer_runs():
     with in_lockstep() as runner:
         sent = send_goal([0.5, 0.0, 0.0], runner=runner, patience=2.0)
         assert sent.result is Result.NOT_SENT
-        runner.add(lambda: GoToGoal(context=runner.context))
+        controller = runner.add(lambda: GoToGoal(context=runner.context))
         sent = send_goal([0.5, 0.0, 0.0], runner=runner, timeout=2.0)
         assert (sent.result, sent.canceled) == (Result.TIMEOUT, True)
+        # By an error of who is told of its progress.
+        runner.add(lambda: VirtualRobot(context=runner.context))
+        progress = Mock(**{'driving.side_effect': BrokenPipeError})
+        with pytest.raises(BrokenPipeError):
+            send_goal([5.0, 0.0, 0.0], runner=runner, progress=progress)
+        assert controller.waypoint is None
+        assert controller.get_publishers_info_by_topic('/goal_pose') == []
 
 
 def test_waypoints_have_the_direction_to_the_next():
@@ -183,9 +156,16 @@ def drive_to(*arguments, code=0):
     return next(line for line in ended.out.splitlines() if 'the robot stopped' in line)
 
 
-@pytest.mark.parametrize('goals', [(-1, 0), (0.5, 0, 0.5, 0.5, 0, 0), (0, 0)])
-def test_arrives(goals):
-    line = drive_to(*goals, '--no-record', *QUICK_ARGUMENTS)
+@pytest.mark.parametrize(
+    ('goals', 'options'),
+    [
+        ((-0.2, 0), ('--params-file', CONFIG / 'turtlebot3_burger.yaml')),
+        ((0, 0), ('--params-file', CONFIG / 'create3.yaml')),
+    ],
+    ids=['behind', 'where it is'],
+)
+def test_arrives(goals, options):
+    line = drive_to(*goals, *options, '--no-record', *QUICK_ARGUMENTS)
     numbers = re.fullmatch(
         r'arrived: the robot stopped at x (\S+) m, y (\S+) m, heading \S+ rad, '
         r'(\S+) m from the goal, after (\S+) s of simulated time',
@@ -197,46 +177,37 @@ def test_arrives(goals):
 
 
 def test_the_true_distance_of_a_robot_that_slips_is_that_of_its_ground_truth():
-    slip = ('-p', 'simulate_slip:=true', '-p', 'wheel_travel_variance:=0.002')
-    line = drive_to(1, 1, *RECORD, *QUICK_ARGUMENTS, *slip)
+    slip = ('-p', 'simulate_slip:=true', '-p', 'wheel_travel_variance:=0.01')
+    line = drive_to(0.5, 0.5, *RECORD, *QUICK_ARGUMENTS, *slip)
     found = re.search(r' (\S+) m from the goal by odometry, (\S+) m by ground truth, after', line)
     distance, truth = map(float, found.groups())
     end = read_run(Path('bag')).ground_truth.values[-1, :2]
     assert distance <= 0.02 < truth
-    assert truth == pytest.approx(math.dist(end, (1.0, 1.0)), abs=1e-3)
+    assert truth == pytest.approx(math.dist(end, (0.5, 0.5)), abs=1e-3)
 
 
-@pytest.mark.parametrize('config', CONFIGS, ids=lambda path: path.stem)
-def test_the_files_in_config_are_taken(config):
-    drive_to(0.2, 0.1, '--tolerance', 0.1, '--params-file', config, '--no-record')
-
-
-@pytest.mark.parametrize('controller', CONTROLLERS)
-def test_every_controller_arrives_and_takes_the_heading_that_is_asked_for(controller):
-    heading = -2.5
-    options = ('--heading', heading, '--controller', controller)
-    line = drive_to(0.5, 0.5, 0, 1, *options, *RECORD, *QUICK_ARGUMENTS)
+@pytest.mark.parametrize('controller', ['pose', 'offset_point'])
+def test_a_controller_arrives_and_takes_the_heading_that_is_asked_for(controller):
+    options = ('--heading', -2.5, '--controller', controller)
+    line = drive_to(0.3, 0.3, 0, 0.6, *options, *RECORD, *QUICK_ARGUMENTS)
     x, y, theta = map(float, re.search(r'x (\S+) m, y (\S+) m, heading (\S+) rad', line).groups())
     offset = 0.1 if controller == 'offset_point' else 0.0
-    assert math.hypot(x, y - 1.0) <= offset + 0.021
-    assert theta == pytest.approx(heading, abs=0.021)
+    assert math.hypot(x, y - 0.6) <= offset + 0.021
+    assert theta == pytest.approx(-2.5, abs=0.021)
     run = read_run(Path('bag'))
     seen = timeline(run)
     last = seen.goal == 1
     # Of the point that is driven: it comes to each goal, and nothing is taken for the next one too soon.
     assert seen.distance[~last].min() <= 0.021
     assert seen.distance[last].min() <= 0.021
-    assert seen.distance[~last][0] == pytest.approx(math.hypot(0.5 - offset, 0.5), abs=1e-6)
     # The heading matters at the last goal alone.
-    error = np.angle(np.exp(1j * (heading - run.odometry.values[:, 2])))
+    error = np.angle(np.exp(1j * (-2.5 - run.odometry.values[:, 2])))
     np.testing.assert_allclose(seen.goal_heading_error[last], error[last], atol=1e-9)
     assert np.isnan(seen.goal_heading_error[~last]).all()
-    assert abs(seen.goal_heading_error[-1]) <= 0.02
-    assert np.isnan(seen.bearing_error[-1])
 
 
 def test_without_a_heading_any_will_do():
-    line = drive_to(0, 1, *RECORD, '--ros-args', '-p', 'kp:=12.0', '-p', 'kv:=2.0')
+    line = drive_to(0, 0.5, *RECORD, '--ros-args', '-p', 'kp:=12', '-p', 'kv:=2')
     theta = float(re.search(r'heading (\S+) rad', line).group(1))
     assert theta == pytest.approx(math.pi / 2.0, abs=0.2)
     assert np.isnan(timeline(read_run(Path('bag'))).goal_heading_error).all()
@@ -244,15 +215,17 @@ def test_without_a_heading_any_will_do():
 
 def test_duration_is_that_of_the_control_law():
     """Straight ahead the distance decays as exp(-kv t), in steps of the odometry's period."""
-    line = drive_to(1, 0, '--no-record', '--ros-args', '-p', 'kv:=2.0')
+    line = drive_to(1, 0, '--no-record', '--ros-args', '-p', 'kv:=4.0')
     seconds = float(re.search(r'after (\S+) s of simulated time', line).group(1))
-    period, kv = 0.02, 2.0
-    steps = math.ceil(math.log(0.02) / math.log(1.0 - kv * period))
-    assert seconds == pytest.approx(steps * period, abs=0.1)
+    steps = math.ceil(math.log(0.02) / math.log(1.0 - 4.0 * 0.02))
+    assert seconds == pytest.approx(steps * 0.02, abs=0.1)
 
 
-def test_nothing_is_driven_once_the_drive_is_over():
-    """The timeout is over before the first odometry, so before a goal was sent."""
+def test_timeout_is_of_simulated_time_and_nothing_is_driven_afterwards():
+    line = drive_to(50, 0, '--no-record', '--timeout', 0.5, code=1)
+    assert line.startswith('not arrived (--timeout 0.5 s was too short): ')
+    assert line.endswith('after 0.5 s of simulated time')
+    # In real time. It is over before the first odometry, so before a goal was sent.
     ended = commands.run('drive_to', 1, 1, '--timeout', '1e-9', *RECORD)
     assert ended.code == 1
     assert 'the robot stopped at x 0.000 m, y 0.000 m' in ended.out
@@ -261,17 +234,11 @@ def test_nothing_is_driven_once_the_drive_is_over():
     assert not run.cmd_vel_out.values.any()
 
 
-def test_timeout_is_of_simulated_time():
-    line = drive_to(50, 0, '--no-record', '--timeout', 3, code=1)
-    assert line.startswith('not arrived (--timeout 3 s was too short): ')
-    assert line.endswith('after 3.0 s of simulated time')
-
-
 FULL = 20_000
 """Size at which the disk of a test is full (bytes): less than a drive of a second."""
 
 
-def test_a_full_disk_is_reported(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported(folder, monkeypatch):
     """A drive that arrives, but of which only a part is recorded, is not done."""
     write, written = os.write, []
 
@@ -283,44 +250,34 @@ def test_a_full_disk_is_reported(tmp_path, monkeypatch):
         return write(descriptor, data)
 
     monkeypatch.setattr(journal.os, 'write', limited)
-    said = commands.run('drive_to', 1, 1, '--lockstep', *RECORD, *QUICK_ARGUMENTS)
-    assert said.code == 1
-    assert 'drive_to: error: the recording was aborted: No space left on device' in said.err
-    assert said.out.splitlines()[-1] == 'recorded in part: bag'
-    assert (tmp_path / 'bag.journal.mcap').exists()
+    ended = commands.run('drive_to', 0.5, 0.5, '--lockstep', *RECORD, *QUICK_ARGUMENTS)
+    assert ended.code == 1
+    assert 'drive_to: error: the recording was aborted: No space left on device' in ended.err
+    assert ended.out.splitlines()[-1] == 'recorded in part: bag'
+    assert (folder / 'bag.journal.mcap').exists()
 
 
-def test_a_stuck_callback_fails_and_the_recording_is_kept(tmp_path, monkeypatch):
+def test_a_stuck_callback_fails_and_the_recording_is_kept(monkeypatch):
     """That run is the one to look at."""
     on_odometry, never = GoToGoal._on_odometry, threading.Event()
 
     def stuck(self, *args):
         on_odometry(self, *args)
-        while self.get_clock().now().nanoseconds > 2_000_000_000:
+        while self.get_clock().now().nanoseconds > 1_500_000_000:
             never.wait(0.01)
 
     monkeypatch.setattr(GoToGoal, '_on_odometry', stuck)
     monkeypatch.setattr(lockstep_runner, 'Lockstep', partial(Lockstep, patience=0.5))
-    said = commands.run('drive_to', 1, 1, '--lockstep', *RECORD)
-    assert said.code == 1
-    assert said.err.startswith('drive_to: error: ')
-    assert '/go_to_goal' in said.err
-    assert said.out.splitlines()[-1] == 'recorded: bag'
-    assert len(read_run(tmp_path / 'bag').odometry) >= 50
+    ended = commands.run('drive_to', 1, 1, '--lockstep', *RECORD)
+    assert ended.code == 1
+    assert ended.err.startswith('drive_to: error: ')
+    assert '/go_to_goal' in ended.err
+    assert ended.out.splitlines()[-1] == 'recorded: bag'
+    assert len(read_run(Path('bag')).odometry) >= 20
 
 
-def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
+def test_a_bug_keeps_the_recording(folder, monkeypatch):
     monkeypatch.setattr(_output.GoalBar, 'show_goal', lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         commands.run('drive_to', 1, 1, '--lockstep', *RECORD)
-    assert (tmp_path / 'bag').is_dir()
-
-
-@pytest.mark.process
-def test_ends_on_a_signal(tmp_path):
-    with open_world(tmp_path) as world:
-        child = world.start('drive_to', '--lockstep', *map(str, CRAWL))
-        child.until_says('m to go')
-        child.signal(signal.SIGINT)
-        assert child.exit() == 130
-        assert child.last_line.startswith('interrupted: the robot stopped at x ')
+    assert (folder / 'bag').is_dir()

@@ -1,12 +1,10 @@
-"""The tool sweep_gains: numbers equal those of single loops and of the theory, mistakes are reported."""
+"""Sweeps of gains and the tool sweep_gains: numbers equal those of single loops and of the theory."""
 
 from __future__ import annotations
 
-import errno
 import math
 import os
 import stat
-import sys
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -21,12 +19,10 @@ from diffdrive_jacobian.control import (
     Arrival,
     VelocityLimits,
     find_controller,
-    go_to_goal,
     go_to_pose,
 )
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
-from diffdrive_jacobian.plots import output_files
-from diffdrive_jacobian.plots import sweep_figure as _sweep_figure
+from diffdrive_jacobian.plots import output_files, sweep_figure
 from diffdrive_jacobian.plots.sweep_figure import TITLES, figure
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import (
@@ -38,12 +34,12 @@ from diffdrive_jacobian.simulation import (
     sweep_table,
 )
 from diffdrive_jacobian.simulation.gain_sweep import MEASURES, columns
-from diffdrive_jacobian.tools import sweep_gains
+from diffdrive_jacobian.tools import _output, sweep_gains
 
 CONFIG = Path(__file__).parents[2] / 'config'
 LIMITS = VelocityLimits(min_v=-0.306, max_v=0.306, min_omega=-1.9, max_omega=1.9, max_wheel_speed=8.559)
 """Those of config/create3.yaml."""
-SMALL = SweepSetup(grid=5, starts=3, rate=20.0)
+SMALL = SweepSetup(grid=5, starts=3, rate=10.0)
 """The least kp with the largest kv does not arrive from everywhere."""
 QUICK = ('--grid', '2', '--starts', '1', '--duration', '20', '--rate', '10')
 small = cache(lambda: sweep(SMALL))
@@ -63,7 +59,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Nothing is drawn, which takes a while."""
-    monkeypatch.setattr(_sweep_figure, 'draw', lambda *_: b'picture')
+    monkeypatch.setattr(sweep_figure, 'draw', lambda *_: b'picture')
 
 
 def left(folder):
@@ -73,35 +69,30 @@ def left(folder):
 # --- The numbers
 
 
-@pytest.mark.parametrize('controller', ['go_to_goal', 'pose'])
-def test_a_cell_is_what_single_loops_give(controller):
+def test_a_cell_is_what_single_loops_give():
     limits = VelocityLimits(min_v=-0.3, max_v=0.3, max_wheel_speed=12.0)
     robot = RobotModel(wheel_radius=0.04, wheel_separation=0.2, limits=limits)
-    setup = replace(SMALL, grid=3, controller=controller, robot=robot, tolerance=0.05)
+    setup = replace(SMALL, grid=3, rate=20.0, controller='pose', robot=robot, tolerance=0.05)
     swept = sweep(setup)
-    law, goal = {'go_to_goal': (go_to_goal, [0.0, 0.0]), 'pose': (go_to_pose, [0.0] * 3)}[controller]
     row, column = 1, 2
     kp, kv = swept.x[column], swept.y[row]
-    one = [
-        closed_loops(
-            law,
-            start[np.newaxis],
-            goal,
-            kp,
-            kv,
-            rate=20.0,
-            duration=60.0,
-            arrival=Arrival(xy_tolerance=0.05, use_heading=controller == 'pose'),
-            turning_gain=kp,
-            limits=limits,
-            r=0.04,
-            L=0.2,
-        )
-        for start in setup.poses()
-    ]
-    assert all(outcome.arrived[0] for outcome in one)
+    loops = closed_loops(
+        go_to_pose,
+        setup.poses(),
+        [0.0, 0.0, 0.0],
+        kp,
+        kv,
+        rate=20.0,
+        duration=60.0,
+        arrival=Arrival(xy_tolerance=0.05, use_heading=True),
+        turning_gain=kp,
+        limits=limits,
+        r=0.04,
+        L=0.2,
+    )
+    assert loops.arrived.all()
     for measure in MEASURES:
-        values = [float(getattr(outcome, measure)[0]) for outcome in one]
+        values = getattr(loops, measure)
         assert swept.mean(measure)[row, column] == pytest.approx(np.mean(values), abs=1e-9)
         assert swept.largest(measure)[row, column] == pytest.approx(max(values), abs=1e-9)
 
@@ -112,29 +103,26 @@ ERRORS = np.linspace(0.0, math.pi / 2.0, 100_001)
 
 def test_beyond_the_boundary_it_spirals_in_as_the_theory_says():
     """The distance decays as exp(-kv cos^2(e) t), with the heading error e at which it settles."""
-    setup = SweepSetup(gains={'kp': (0.5, 2.0), 'kv': (0.5, 2.0)}, grid=4, starts=4, duration=80.0)
+    setup = SweepSetup(gains={'kp': (0.5, 2.0), 'kv': (0.5, 2.0)}, grid=3, starts=2, duration=80.0)
     near, nearer = (sweep(replace(setup, tolerance=tolerance)) for tolerance in (2e-3, 2e-5))
-    assert near.complete.all()
     assert nearer.complete.all()
     taken = nearer.outcomes.time - near.outcomes.time
-    seen = set()
-    for row, kv in enumerate(near.y.tolist()):
-        for column, kp in enumerate(near.x.tolist()):
-            if 0.85 < kp / kv < 1.3:
-                # At the border itself it takes long to settle.
-                continue
-            error = np.interp(-kp / kv, -np.sinc(2.0 * ERRORS / math.pi), ERRORS)
-            decay = kv * math.cos(error) ** 2
-            assert taken[row, column] == pytest.approx(math.log(100.0) / decay, rel=0.03), (kp, kv)
-            seen.add(kp < kv)
-    assert seen == {True, False}
+    kp, kv = np.meshgrid(near.x, near.y)
+    error = np.interp(-kp / kv, -np.sinc(2.0 * ERRORS / math.pi), ERRORS)
+    expected = math.log(100.0) / (kv * np.cos(error) ** 2)
+    # At the boundary itself it takes long to settle.
+    settled = abs(kp / kv - 1.0) > 0.3
+    assert {(kp < kv)[settled].any(), (kp > kv)[settled].any()} == {True}
+    for start in range(2):
+        np.testing.assert_allclose(taken[settled, start], expected[settled], rtol=0.03)
 
 
-@pytest.mark.parametrize('count', [1, 2, 7])
-def test_starts_lie_evenly_around_the_goal_and_face_all_directions(count):
+@pytest.mark.parametrize('count', [1, 7])
+def test_starts_lie_evenly_around_the_goal_and_gains_are_decimals(count):
+    assert SweepSetup().values(KP).tolist() == [round(0.2 + 0.1 * k, 1) for k in range(59)]
+    assert SweepSetup().values(KV).tolist() == [round(0.1 + 0.05 * k, 2) for k in range(59)]
     poses = SweepSetup(starts=count, distance=3.0).poses()
-    assert poses.shape == (count, 3)
-    assert np.hypot(poses[:, 0], poses[:, 1]) == pytest.approx(3.0)
+    assert np.hypot(poses[:, 0], poses[:, 1]) == pytest.approx(np.full(count, 3.0))
     bearings = np.sort(np.arctan2(poses[:, 1], poses[:, 0]) % math.tau)
     assert np.diff(bearings) == pytest.approx(math.tau / count)
     errors = wrap_angle(np.arctan2(-poses[:, 1], -poses[:, 0]) - poses[:, 2])
@@ -142,14 +130,7 @@ def test_starts_lie_evenly_around_the_goal_and_face_all_directions(count):
     assert np.sort(abs(errors)) == pytest.approx(sizes, abs=1e-12)
 
 
-def test_gains_are_decimals():
-    setup = SweepSetup()
-    assert setup.values(KP).tolist() == [round(0.2 + 0.1 * index, 1) for index in range(59)]
-    assert setup.values(KV).tolist() == [round(0.1 + 0.05 * index, 2) for index in range(59)]
-    assert (setup.values(KP)[28], setup.values(KV)[8]) == (3.0, 0.5)
-
-
-def test_means_are_over_those_that_arrived():
+def test_means_are_over_those_that_arrived_and_the_fastest_is_one_from_which_all_do():
     swept = sweep(replace(SMALL, duration=5.8))
     partly = np.argwhere((swept.arrived > 0) & ~swept.complete)
     assert len(partly)
@@ -157,42 +138,30 @@ def test_means_are_over_those_that_arrived():
         times = swept.outcomes.time[row, column]
         assert swept.mean('time')[row, column] == pytest.approx(np.nanmean(times))
         assert swept.largest('time')[row, column] == np.nanmax(times)
-    none = sweep(replace(SMALL, duration=0.5))
+    # From some cells only some arrive, and were they quick: they do not count.
+    swept = small()
+    quick = swept.outcomes._replace(time=np.where(swept.complete[..., None], swept.outcomes.time, 0.1))
+    assert swept._replace(outcomes=quick).fastest() == swept.fastest() == (4, 4)
+    words = 'fastest: kp 6, kv 3 (the largest kp and the largest kv of the grid): at the goal after 1.'
+    assert describe_sweep(swept).startswith(words)
+    # Inside the grid: at so low a rate it overshoots with large gains.
+    gains = {'kp': (0.5, 5.0), 'kv': (0.5, 3.0)}
+    assert 'of the grid' not in describe_sweep(sweep(replace(SMALL, grid=7, gains=gains, rate=2.0)))
+    none = sweep(replace(SMALL, grid=2, duration=1.0))
     assert np.isnan(none.mean('path_length')).all()
     assert np.isnan(none.largest('path_length')).all()
     assert none.fastest() is None
+    words = 'no gains bring the robot to the goal from every start within 1 s'
+    assert describe_sweep(none) == words
+    rows = sweep_table(none).splitlines()
+    assert rows[1:] == [f'{kp},{kv},3,0,,,,,,' for kp in (0.2, 6.0) for kv in (0.1, 3.0)]
 
 
-def test_the_fastest_is_one_from_which_all_arrive():
-    swept = small()
-    # From the corner some arrive, and were they quick: they do not count.
-    quick = swept.outcomes._replace(time=np.where(swept.complete[..., None], swept.outcomes.time, 0.1))
-    assert swept._replace(outcomes=quick).fastest() == swept.fastest() == (4, 4)
-
-
-def test_progress_is_reported_at_every_step_and_may_end_all():
-    seen = []
-    sweep(replace(SMALL, grid=2), seen.append)
-    assert seen == sorted(seen)
-    assert seen[0] == 0
-    assert 2 * 2 * 3 > seen[-1] > 0
-
-    def stop(done):
-        raise KeyError(done)
-
-    with pytest.raises(KeyError):
-        sweep(SMALL, stop)
-
-
-def test_it_says_which_gains_are_the_fastest():
-    assert describe_sweep(small()).startswith(
-        'fastest: kp 6, kv 3 (the largest kp and the largest kv of the grid): at the goal after 1.'
-    )
-    # Asked that seldom, it overshoots with large gains.
-    words = describe_sweep(
-        sweep(SweepSetup(grid=7, starts=3, gains={'kp': (0.5, 5.0), 'kv': (0.5, 3.0)}, rate=2.0))
-    )
-    assert 'of the grid' not in words
+def test_a_setup_checks_itself():
+    with pytest.raises(ValueError, match="controller must be one of 'go_to_goal', 'offset_point'"):
+        SweepSetup(controller='other')
+    with pytest.raises(ValueError, match="gains must be of kv, offset, those of 'offset_point'"):
+        SweepSetup(controller='offset_point', gains={'kp': 1.0})
 
 
 # --- Files
@@ -214,7 +183,7 @@ def test_plain_it_writes_a_picture_and_the_numbers_and_overwrites_nothing(folder
     stem = 'sweep_2026_01_02-03_04_05'
     first = run(*QUICK)
     assert first.out.splitlines()[:2] == [f'{stem}.csv', f'{stem}.png']
-    assert first.out.splitlines()[2].startswith('fastest: kp 6, kv 3 (the largest kp and the largest')
+    assert first.out.splitlines()[2].startswith('fastest: kp 6, kv 3 ')
     assert (first.code, first.err) == (0, '')
     # Others take names meanwhile.
     taken = [f'{stem}__2.png', f'{stem}__3.csv']
@@ -225,35 +194,36 @@ def test_plain_it_writes_a_picture_and_the_numbers_and_overwrites_nothing(folder
     assert left(folder) == sorted([*taken, *made])
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures('no_display')
-def test_what_is_named_is_what_is_written_without_a_display(folder):
+def test_the_picture_is_written_without_a_display(folder):
     assert run(*QUICK, '-o', 'a.PNG').out.startswith('a.PNG\nfastest: ')
     assert left(folder) == ['a.PNG']
     assert Path('a.PNG').read_bytes().startswith(b'\x89PNG\r\n')
-    assert Path('a.PNG').stat().st_size < 600_000
 
 
 def test_csv_holds_the_numbers(folder):
-    assert run('--grid', 5, '--starts', 3, '--rate', 20, '--csv', 'a.csv').code == 0
+    assert run('--grid', 5, '--starts', 3, '--rate', 10, '--csv', 'a.csv').code == 0
     assert left(folder) == ['a.csv']
-    told, swept = np.genfromtxt('a.csv', delimiter=',', names=True), small()
-    assert told.dtype.names == columns(swept.setup)
-    assert told['kp_per_s'].tolist() == np.repeat(swept.x, 5).tolist()
-    assert told['kv_per_s'].tolist() == np.tile(swept.y, 5).tolist()
-    assert set(told['starts']) == {3.0}
-    assert told['arrived'].tolist() == swept.arrived.T.ravel().tolist()
+    found, swept = np.genfromtxt('a.csv', delimiter=',', names=True), small()
+    assert found.dtype.names == columns(swept.setup)
+    assert found['kp_per_s'].tolist() == np.repeat(swept.x, 5).tolist()
+    assert found['kv_per_s'].tolist() == np.tile(swept.y, 5).tolist()
+    assert set(found['starts']) == {3.0}
+    assert found['arrived'].tolist() == swept.arrived.T.ravel().tolist()
     units = {'time': 's', 'path_length': 'm', 'overshoot': 'm'}
     for measure, unit in units.items():
         for name, values in (('mean', swept.mean(measure)), ('max', swept.largest(measure))):
-            np.testing.assert_array_equal(told[f'{measure}_{name}_{unit}'], values.T.ravel())
+            np.testing.assert_array_equal(found[f'{measure}_{name}_{unit}'], values.T.ravel())
 
 
-def test_what_did_not_arrive_is_empty_in_the_csv():
-    rows = sweep_table(sweep(replace(SMALL, grid=2, duration=1.0))).splitlines()
-    assert rows[1:] == [f'{kp},{kv},3,0,,,,,,' for kp in (0.2, 6.0) for kv in (0.1, 3.0)]
-    out = run(*QUICK, '--duration', 1, '--csv', 'a.csv').out.splitlines()
-    assert out == ['a.csv', 'no gains bring the robot to the goal from every start within 1 s']
+def test_where_nobody_may_write_is_reported_before_the_batch(folder, monkeypatch):
+    monkeypatch.delattr(sweep_gains, 'sweep')
+    for option, name in (('-o', 'none/a.png'), ('--csv', f'{"a" * 300}.csv')):
+        assert refused(option, name, code=1).startswith(f'{name} cannot be written: ')
+    # Root may write everywhere, and tests may run as root.
+    monkeypatch.setattr(os, 'access', lambda path, mode: not (mode & stat.S_IWOTH))
+    assert refused(code=1).endswith('.png cannot be written: Permission denied')
+    assert left(folder) == []
 
 
 # --- Options
@@ -272,7 +242,6 @@ OPTIONS = {
     '--max-velocity 0.5 --max-yaw-rate 2': {
         'limits': VelocityLimits(min_v=-0.5, max_v=0.5, min_omega=-2.0, max_omega=2.0)
     },
-    f'--params-file {CONFIG}/create3.yaml': {**CREATE3, 'limits': LIMITS},
     f'--params-file {CONFIG}/create3.yaml --max-velocity 0.1': {
         **CREATE3,
         'limits': replace(LIMITS, min_v=-0.1, max_v=0.1),
@@ -314,7 +283,8 @@ def legend(made):
 
 
 def test_maps_show_the_means_with_units():
-    swept = small()
+    swept = sweep(replace(SMALL, duration=5.8))
+    assert ((swept.arrived > 0) & ~swept.complete).any()
     made = figure(swept)
     assert set(maps(made)) == set(MEASURES)
     for measure, panel in maps(made).items():
@@ -326,24 +296,16 @@ def test_maps_show_the_means_with_units():
         values = mesh.get_array().reshape(5, 5)
         assert (np.ma.getmaskarray(values) == ~swept.complete).all()
         np.testing.assert_array_equal(values.compressed(), swept.mean(measure)[swept.complete])
-        assert mesh.get_cmap().name == 'viridis'
         # The cell of kp is around it.
         edges = mesh.get_coordinates()[0, :, 0]
-        assert (edges[:-1] <= swept.x).all()
-        assert (swept.x <= edges[1:]).all()
+        np.testing.assert_allclose(edges[1:-1], (swept.x[1:] + swept.x[:-1]) / 2.0)
         assert panel.patch.get_hatch()
-    title = made.get_suptitle() if hasattr(made, 'get_suptitle') else made._suptitle.get_text()
-    for word in ('go_to_goal', '3 starts', '2 m', '20 Hz', 'limits: none', '0.02 m'):
+    title = made._suptitle.get_text()
+    for word in ('go_to_goal', '3 starts', '2 m', '10 Hz', 'limits: none', '0.02 m'):
         assert word in title
-    assert 'not all starts arrived within 60 s' in legend(made)
-
-
-def test_a_fine_grid_has_lines_of_equal_values():
-    fine = figure(sweep(replace(SMALL, grid=_sweep_figure.CONTOUR_GRID, starts=1)))
-    counts = [
-        [len(panel.collections) for panel in maps(made).values()] for made in (figure(small()), fine)
-    ]
-    assert all(with_lines > without for without, with_lines in zip(*counts, strict=True))
+    assert legend(made)[1] == 'defaults: kp 3, kv 0.5'
+    assert legend(made)[2].startswith('fastest: kp 6, kv 3, ')
+    assert 'not all starts arrived within 5.8 s' in legend(made)
 
 
 @pytest.mark.parametrize('controller', ['go_to_goal', 'pose'])
@@ -354,36 +316,35 @@ def test_the_boundary_is_drawn_in_every_map(controller):
     assert name == {1.0: 'kp = kv', 2.0: 'kp = 2 kv'}[factor]
     assert f'{name}: {what}' in legend(made)
     for panel in maps(made).values():
-        line = next(one for one in panel.lines if one.get_linestyle() == '--' or one.is_dashed())
+        line = next(one for one in panel.lines if one.is_dashed())
         kp, kv = line.get_data()
         assert kp == pytest.approx(factor * kv)
         assert (kv[0], kv[-1]) == pytest.approx((max(0.1, 0.2 / factor), 3.0))
         assert [text.get_text() for text in panel.texts] == [name]
 
 
-def test_only_what_lies_in_the_picture_is_marked():
-    setup = replace(SMALL, gains={'kp': (5.0, 6.0), 'kv': (0.5, 0.6)}, grid=2)
-    made = figure(sweep(setup))
-    (only,) = legend(made)
+def test_a_fine_grid_has_lines_of_equal_values_and_only_what_lies_in_it_is_marked():
+    gains = {'kp': (5.0, 6.0), 'kv': (0.5, 0.6)}
+    coarse = figure(sweep(replace(SMALL, gains=gains, grid=2)))
+    (only,) = legend(coarse)
     assert only.startswith('fastest: kp 6, kv 0.6, ')
-    assert not any(panel.texts for panel in maps(made).values())
-    texts = legend(figure(small()))
-    assert texts[1] == 'defaults: kp 3, kv 0.5'
-    assert texts[2].startswith('fastest: kp 6, kv 3, ')
+    assert not any(panel.texts for panel in maps(coarse).values())
+    # Nothing arrives so soon.
+    assert 'fastest' not in ' '.join(legend(figure(sweep(replace(SMALL, grid=2, duration=0.01)))))
+    fine = figure(sweep(replace(SMALL, grid=sweep_figure.CONTOUR_GRID, starts=1)))
+    for lined, plain in zip(maps(fine).values(), maps(coarse).values(), strict=True):
+        assert len(lined.collections) > len(plain.collections)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    'changes',
-    [
-        {'duration': 0.01},
-        {'controller': 'pose', 'gains': {'kp': (2.0, 2.000001), 'kv': (0.4, 0.400001)}, 'starts': 1},
-    ],
-    ids=str,
-)
-def test_everything_drawn_lies_inside_the_picture(changes):
-    setup = replace(SMALL, grid=3, robot=RobotModel(limits=replace(LIMITS, min_v=-0.1)), **changes)
-    made = figure(sweep(setup))
+def test_everything_drawn_lies_inside_the_picture_whatever_the_users_style():
+    import matplotlib
+
+    # The longest title, and labels of many digits.
+    gains = {'kp': (2.0, 2.000001), 'kv': (0.4, 0.400001)}
+    robot = RobotModel(limits=replace(LIMITS, min_v=-0.1))
+    setup = replace(SMALL, grid=2, starts=1, controller='pose', gains=gains, robot=robot)
+    with matplotlib.rc_context({'figure.figsize': (1, 1), 'text.usetex': True, 'image.cmap': 'jet'}):
+        made = figure(sweep(setup))
     made.get_layout_engine().execute(made)
     width, height = made.get_size_inches() * made.dpi
     above = made._suptitle.get_window_extent()
@@ -395,114 +356,20 @@ def test_everything_drawn_lies_inside_the_picture(changes):
     assert above.y0 > max(title.y1 for title in titles)
 
 
-def test_the_users_style_does_not_matter():
-    import matplotlib
-
-    with matplotlib.rc_context({'figure.figsize': (1, 1), 'text.usetex': True, 'image.cmap': 'jet'}):
-        made = figure(small())
-        assert matplotlib.rcParams['text.usetex'] is True
-    assert made.get_size_inches().tolist() == [*_sweep_figure.SIZE]
-
-
-# --- Mistakes
-
-
-def test_invalid_parameters_are_reported(folder):
-    file = folder / 'wrong.yaml'
-    for content, words in (
-        (
-            'virtual_robot:\n  ros__parameters:\n    wheel_radius: -1.0\n',
-            "parameter 'wheel_radius' must be in [0.001, 10], got -1.0",
-        ),
-        ('words', '--params-file must be a file of ROS parameters, got wrong.yaml'),
-    ):
-        file.write_text(content)
-        assert words in refused('--params-file', file.name)
-    assert left(folder) == ['wrong.yaml']
-
-
-def test_a_setup_checks_itself():
-    for changes in ({'rate': math.nan}, {'duration': -1.0}, {'tolerance': math.inf}):
-        with pytest.raises(ValueError, match=f'{next(iter(changes))} must be positive and finite'):
-            SweepSetup(**changes)
-    with pytest.raises(ValueError, match="controller must be one of 'go_to_goal', 'offset_point'"):
-        SweepSetup(controller='other')
-    with pytest.raises(ValueError, match="gains must be of kv, offset, those of 'offset_point'"):
-        SweepSetup(controller='offset_point', gains={'kp': 1.0})
-
-
-def test_where_nobody_may_write_is_reported_before_the_batch(folder, monkeypatch):
-    monkeypatch.delattr(sweep_gains, 'sweep')
-    Path('file').touch()
-    for place in ('none/a', 'file/a', 'a' * 300):
-        for option, ending in (('-o', 'png'), ('--csv', 'csv')):
-            message = refused(option, f'{place}.{ending}', code=1)
-            assert message.startswith(f'{place}.{ending} cannot be written: ')
-    # Root may write everywhere, and tests may run as root.
-    monkeypatch.setattr(os, 'access', lambda path, mode: not (mode & stat.S_IWOTH))
-    message = refused(code=1)
-    assert message.startswith('sweep_20')
-    assert message.endswith(f'.png cannot be written: {os.strerror(errno.EACCES)}')
-    assert left(folder) == ['file']
-
-
-@pytest.mark.usefixtures('undrawn')
-def test_a_file_that_cannot_be_written_does_not_keep_the_other(folder, monkeypatch):
-    inner = sweep_gains.create
-
-    def full(path, data, **options):
-        if path.suffix == '.csv':
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        inner(path, data, **options)
-
-    monkeypatch.setattr(sweep_gains, 'create', full)
-    code, out, err = run(*QUICK, '-o', 'a.png', '--csv', 'a.csv')
-    assert (code, out.splitlines()[0]) == (1, 'a.png')
-    assert err == 'sweep_gains: error: a.csv cannot be written: No space left on device\n'
-    assert left(folder) == ['a.png']
-
-
-def test_without_matplotlib_it_says_so_before_the_batch(folder, monkeypatch):
-    for name in [name for name in sys.modules if name.split('.')[0] == 'matplotlib']:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, 'matplotlib', None)
-    assert run(*QUICK, '--csv', 'a.csv').out.startswith('a.csv\nfastest: ')
-    monkeypatch.delattr(sweep_gains, 'sweep')
-    message = refused()
-    assert "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'" in message
-    assert '--csv FILE' in message
-    assert left(folder) == ['a.csv']
-
-
 # --- Signals
 
 
-class Later(Signals):
-    """A signal that comes when it was looked for so often."""
-
-    def __init__(self, patience):
-        self._patience = patience
-
-    @property
-    def count(self):
-        self._patience -= 1
-        return int(self._patience < 0)
-
-
-@pytest.mark.parametrize('patience', [0, 50])
-def test_a_signal_ends_it_and_nothing_is_left(folder, patience):
-    ended = run(*QUICK, signals=Later(patience))
-    assert ended == (130, '', 'sweep_gains: interrupted: nothing was written\n')
-    assert left(folder) == []
-
-
-def test_a_signal_while_it_draws_ends_it(folder, monkeypatch):
+def test_a_signal_during_the_batch_or_the_drawing_ends_it(folder, monkeypatch):
+    interrupted = (130, '', 'sweep_gains: interrupted: nothing was written\n')
     signals = Signals()
 
-    def draw(*_):
+    def signal(*_):
         signals.count = 1
         return b'picture'
 
-    monkeypatch.setattr(_sweep_figure, 'draw', draw)
-    assert run(*QUICK, signals=signals).code == 130
+    monkeypatch.setattr(sweep_figure, 'draw', signal)
+    assert run(*QUICK, signals=signals) == interrupted
+    signals.count = 0
+    monkeypatch.setattr(_output.Bar, 'show', signal)
+    assert run(*QUICK, signals=signals) == interrupted
     assert left(folder) == []

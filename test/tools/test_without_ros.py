@@ -7,19 +7,17 @@ come with ROS or with the extra `jazzy`.
 from __future__ import annotations
 
 import shutil
+import socket
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fork_server import forked
-from rclpy.serialization import serialize_message
 from support.bags import REAL, SECOND, changed, odom, start, status, write_bag
 from support.commands import COMMANDS, error_of, run, run_each
 from support.ros_messages import goal, goals, joint_command, twist_stamped
 
 from diffdrive_jacobian.bags import read_run
-from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message
-from diffdrive_jacobian.bags.message_definitions import known_definition
 from diffdrive_jacobian.tools.entry_points import ROS_MODULES
 
 pytestmark = pytest.mark.process
@@ -104,28 +102,13 @@ def test_tools_work_as_with_ros(tmp_path, ours):
         np.testing.assert_array_equal(saved.odometry.values, original.odometry.values)
 
 
-def test_a_journal_is_recovered(tmp_path):
-    """Of types that are not known the messages are saved, and reported as not checked."""
-    writer = JournalWriter(tmp_path / 'run.journal.mcap')
-    mine = Channel(
-        id=0, topic='/x', type_name='a_msgs/msg/A', definition='int32 a\n', type_hash='RIHS01_0'
-    )
-    known = known_definition('nav_msgs/msg/Odometry')
-    theirs = Channel(
-        id=1, topic='/odom', type_name=known.name, definition=known.text, type_hash=known.type_hash
-    )
-    for record in (
-        *(mine, theirs, Message(0, SECOND, b'\0\1\0\0\1\0\0\0')),
-        *(Message(1, SECOND, data) for data in (serialize_message(odom(0, 0, 0)), b'\0\1\0\0xyz')),
-    ):
-        writer.add(record)
-    writer.flush()
-    writer.close()
-    (ended,) = without_ros(('recover_run', tmp_path / 'run.journal.mcap'))
-    assert (ended.code, ended.err) == (0, '')
-    assert 'the 1 messages on /x were not checked' in ended.out
-    assert '1 of 2 messages on /odom cannot be decoded' in ended.out
-    assert len(read_run(tmp_path / 'run').odometry) == 1
+def test_a_bag_is_watched_without_ros(ours):
+    """The bag is read, and then there is no port for the page."""
+    with socket.create_server(('127.0.0.1', 0)) as taken:
+        port = taken.getsockname()[1]
+        (ended,) = without_ros(('watch_run', ours, '--no-browser', '--port', port))
+    assert ended.code == 1
+    assert f'--port {port} is in use' in error_of('watch_run', ended)
 
 
 def test_other_missing_modules(tmp_path):

@@ -1,4 +1,4 @@
-"""All errors of this package have one base class, and every name is that of one class."""
+"""What all modules share: errors with one base class, seconds and nanoseconds."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ import importlib
 import pkgutil
 from collections.abc import Iterator
 
-import pytest
-
 import diffdrive_jacobian
-from diffdrive_jacobian.bags.files import NotARegularFileError
 from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds, seconds
 
 PACKAGE = diffdrive_jacobian.__name__
 NOT_ERRORS = {'Stuck', 'StopShrinking', 'TaskNotEnded'}
@@ -25,34 +23,29 @@ def raised(base: type[BaseException]) -> Iterator[type[BaseException]]:
         yield from raised(one)
 
 
-@pytest.fixture(scope='module')
-def classes() -> set[type[BaseException]]:
+def test_every_error_has_the_base_class_a_docstring_and_a_name_of_its_own():
     for module in pkgutil.walk_packages(diffdrive_jacobian.__path__, f'{PACKAGE}.'):
         importlib.import_module(module.name)
-    return set(raised(BaseException))
-
-
-def test_every_error_has_the_base_class(classes):
+    classes = set(raised(BaseException))
     others = {one for one in classes if not issubclass(one, DiffdriveError)}
     assert {one.__name__ for one in others} == NOT_ERRORS
     assert not [one for one in others if issubclass(one, Exception)]
     assert len(classes - others) > 30
-
-
-def test_every_name_is_that_of_one_class(classes):
+    assert all(one.__dict__['__doc__'] for one in classes)
     modules: dict[str, set[str]] = {}
     for one in classes:  # a module that a test imported again has its classes twice
         modules.setdefault(one.__name__, set()).add(one.__module__)
     assert not {name: where for name, where in modules.items() if len(where) > 1}
 
 
-def test_every_error_has_a_docstring(classes):
-    assert all(one.__dict__['__doc__'] for one in classes)
+# --- Time
 
 
-def test_a_builtin_base_keeps_its_meaning(tmp_path):
-    assert issubclass(NotARegularFileError, OSError)
-    error = NotARegularFileError(2, 'No such file', str(tmp_path))
-    assert (error.errno, error.filename) == (2, str(tmp_path))
-    with pytest.raises(OSError, match='must be'):
-        raise NotARegularFileError('must be a regular file')
+def test_durations_are_rounded_to_nanoseconds_and_only_zero_becomes_zero():
+    cases = {1.0: NANOSECONDS, 0.1 + 0.2: 300_000_000, -1.5: -1_500_000_000, 0.0: 0}
+    # A timeout of 0 means that there is none.
+    cases |= {1e-12: 1, -5e-324: -1, 1e300: int(1e300) * NANOSECONDS}
+    for duration, expected in cases.items():
+        assert nanoseconds(duration) == expected
+    stamp = 1_700_000_000 * NANOSECONDS
+    assert nanoseconds(seconds(stamp)) == stamp
