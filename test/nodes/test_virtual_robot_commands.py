@@ -256,7 +256,9 @@ def test_initialpose_while_driving_carries_its_covariance(lockstep, add):
     lockstep.run_for(0.25)
     # The index of the diagonal is that of z, roll or pitch, which the plane fixes.
     for index in (14, 21, 28):
-        message = placement(*target, variances=(0.25, 0.5, 0.07), frame='' if index > 14 else 'elsewhere')
+        message = placement(
+            *target, variances=(0.25, 0.5, 0.07), frame='' if index > 14 else 'elsewhere'
+        )
         lockstep.publish('initialpose', spoiled(message, f'pose.covariance.{index}', math.nan))
     assert len(topics.starts) == 4
     assert value_of(POSE_WITH_COVARIANCE, topics.starts[-1]).pose == pytest.approx(target)
