@@ -30,7 +30,6 @@ from diffdrive_jacobian.control import (
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.parameters.declaration import ParameterError
 
 LAWS = {
     'go_to_goal': lambda pose, to, kp, kv, d: go_to_goal(pose, to[:2], kp, kv),
@@ -171,34 +170,6 @@ def test_the_robot_is_driven_to_where_it_arrives_after_a_change(lockstep, before
     if after != 'offset_point':
         # The axle centre stays where it is while the robot turns.
         assert distances[-1] <= 0.02
-
-
-# --- What is refused
-
-CHOICES = "'controller' must be one of 'go_to_goal', 'offset_point', 'pose', got "
-REFUSED = [
-    *(({'controller': bad}, f'{CHOICES}{bad!r}') for bad in ('', 'Pose')),
-    *(({'controller': bad}, "'controller'") for bad in (2.0, ['pose'])),
-    *(({'offset': bad}, "'offset' must be .*rank 1") for bad in (0.0, 0.0009, -0.0009)),
-    *(({'offset': bad}, "'offset' must be in") for bad in (math.nan, 101.0)),
-    *(({name: bad}, name) for name in ('kp', 'kv') for bad in (0.0, math.nan, 101.0)),
-]
-
-
-def test_invalid_laws_and_gains_are_refused_at_the_start_and_live(lockstep):
-    controller = Controller(lockstep, controller='offset_point', offset=-0.3)
-    controller.send(goal(1.0, 0.4, 2.0))
-    before, parameters = controller.at(0.0, 0.0), controller.node.parameters
-    for values, words in REFUSED:
-        with pytest.raises(ParameterError, match=words) as caught:
-            make(GoToGoal, **{'controller': 'offset_point', **values})
-        result = change(controller.node, xy_goal_tolerance=0.5, **values)
-        assert not result.successful, values
-        # What rclpy refuses, types and ranges, it describes itself.
-        by_rclpy = result.reason.startswith(('Wrong parameter type', 'Parameter '))
-        assert by_rclpy or result.reason == str(caught.value)
-    assert controller.node.parameters == parameters
-    assert controller.at(0.0, 0.0) == before
 
 
 # --- Warnings

@@ -9,7 +9,6 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from geometry_msgs.msg import Twist, TwistStamped
-from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import SECOND, Topics, change, comes_after
 from support.ros_messages import (
@@ -315,39 +314,3 @@ def test_uncertainty_grows_with_the_variance_of_the_wheels(lockstep, add):
     arc = ((1.0, 0.0), 0.2, 0.16, variance)
     expected = propagate_moments(gaussian(np.zeros((3, 3))), np.zeros(3), *arc).second_moment
     assert covariance_of(topics.odom[-1]) == pytest.approx(expected, rel=1e-9, abs=1e-16)
-
-
-BAD = [
-    ({'wheel_radius': 0.0}, 'wheel_radius'),
-    ({'wheel_radius': math.nan}, 'wheel_radius'),
-    ({'wheel_radius': 'big'}, 'expected'),
-    ({'linear__x__max_velocity': -1.0}, "'linear.x.max_velocity' must be in [0, 1000]"),
-    ({'linear__x__min_velocity': 0.5}, 'got 0.5'),
-    ({'max_wheel_velocity': math.inf}, 'or .nan for none'),
-    ({'base_frame_id': ''}, "'base_frame_id' must be not empty"),
-    ({'base_frame_id': 'odom'}, 'must differ'),
-    ({'command_interface': 'wheels'}, 'read-only'),
-    ({'publish_rate': 2000.0}, 'publish_rate'),
-    ({'wheel_separation': 1.0, 'cmd_vel_timeout': -1.0}, 'cmd_vel_timeout'),
-]
-
-
-def test_bad_changes_are_refused_with_the_reason_and_change_nothing(lockstep, driving):
-    before = driving.robot.parameters
-    lockstep.run_for(0.2)
-    for changes, words in BAD:
-        result = change(driving.robot, **changes)
-        assert not result.successful
-        assert words in result.reason
-        assert driving.robot.parameters == before
-    lockstep.run_for(0.32)
-    assert instants(driving.applied) == [SECOND, SECOND + SECOND // 2]
-    assert pose_of(driving.odom[-1]).tolist() == [0.5, 0.0, 0.0]
-
-
-def test_integers_are_taken_for_doubles_and_other_parameters_are_left_alone(driving):
-    assert driving.robot.set_parameters([Parameter('wheel_separation', value=1)])[0].successful
-    assert driving.robot.parameters.wheel_separation == 1.0
-    assert driving.robot.get_parameter('wheel_separation').value == 1.0
-    driving.robot.declare_parameter('foreign', 3)
-    assert driving.robot.set_parameters([Parameter('foreign', value=4)])[0].successful

@@ -215,21 +215,6 @@ def test_time_that_goes_back_leaves_the_robot_where_it_is(lockstep, driving, cap
     assert f'time went back by {seconds:.3f} s' in capfd.readouterr().err
 
 
-@late
-def test_time_that_goes_back_again_and_again_adds_no_motion(lockstep, robot_at):
-    topics = Topics(lockstep)
-    robot_at(0.0, 0.0, 3.0)
-    for count in range(1, 6):
-        lockstep.publish('cmd_vel', twist(0.0, 1.0))
-        lockstep.run_for(0.24)
-        lockstep.jump(-2.0)
-        assert len(topics.starts) == count + 1
-    lockstep.run_for(0.6)
-    assert pose_of(topics.odom[-1]) == pytest.approx([0.0, 0.0, 4.2 - math.tau], abs=1e-14)
-    turned = 5 * 0.24 * 0.08 / 0.033
-    assert list(topics.states[-1].position) == pytest.approx([-turned, turned], rel=1e-14)
-
-
 # --- Placements
 
 
