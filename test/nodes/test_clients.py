@@ -50,14 +50,18 @@ def add_client(ros, goals, **kwargs):
 # --- Goals
 
 
-def test_goals_are_sent_with_the_first_odometry_unless_withdrawn(ros):
+def test_goals_are_sent_with_the_first_odometry_unless_withdrawn(ros, capfd):
     client = add_client(ros, [[1.0, 0.0, 0.0], [1.0, 1.0, 0.5]])
     received, talk = ros.listen(Goals, 'goals'), ros.talk(Odometry, 'odom')
     assert client.distance == math.inf
     client.send_on_odometry()
     client.withdraw()
+    bad = odometry(0.1, 0.0, 0.0)
+    bad.header.stamp.sec = -1
+    talk.publish(bad)
     talk.publish(odometry(0.5, 0.0, 0.0))
     ros.until(lambda: client.robot is not None, 'odometry is received')
+    assert 'odometry dropped: its stamp must have sec of at least 0' in capfd.readouterr().err
     assert not client.sent
     assert client.distance == 0.5
     client.index = 1

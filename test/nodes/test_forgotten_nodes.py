@@ -15,11 +15,9 @@ from sensor_msgs.msg import JointState
 from support.lockstep_nodes import ACCEPTED, CANCELED, EXECUTING, SUCCEEDED, Controller, Topics
 from support.ros_messages import goal, goals, joint_command, placement, twist, twists
 
-from diffdrive_jacobian.messages.cdr import integer_warning
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros.graph_faults import Interleaving, LastingFault
 from diffdrive_jacobian.ros.node import FAULT_PATIENCE
 
 WHEELS = {'command_interface': 'wheels'}
@@ -44,31 +42,6 @@ def node(lockstep):
 
 
 # --- Faults
-
-
-def test_a_fault_is_reported_once_after_it_has_lasted_and_again_after_it_was_gone():
-    fault = LastingFault(3)
-    present = ['a'] * 5 + [None] + ['a'] * 4 + ['b'] * 2 + ['a'] * 2 + ['b'] * 3
-    reports = [fault.check(one) for one in present]
-    assert [(index, one) for index, one in enumerate(reports) if one] == [(2, 'a'), (8, 'a'), (16, 'b')]
-
-
-def test_alternating_publishers_are_told_by_their_sequence_numbers():
-    def falls(*numbers):
-        commands = Interleaving()
-        for commands.number in numbers:
-            commands.count()
-        found = commands.falls()
-        assert commands.falls() == 0
-        return found
-
-    assert falls() == falls(1, 2, 3, 5, 90) == 0
-    # A publisher that was restarted.
-    assert falls(7, 8, 1, 2, 3) == 1
-    assert falls(1, 1, 2, 2, 3, 3) == 3
-    assert falls(1000, 4, 1001, 5, 1002, 6) == 3
-    # Middleware without sequence numbers.
-    assert falls(None, None) == 0
 
 
 # --- Forgotten nodes
@@ -215,13 +188,6 @@ def test_a_controller_that_publishes_best_effort_knows_its_own_commands(lockstep
 
 
 # --- Integers
-
-
-def test_integers_in_fields_of_floats_are_told():
-    for integer in (INTEGER, -INTEGER, 4.9e-323):
-        assert integer_warning('it', 0.0, integer) is not None
-    for value in (0.0, 1.0, 1e-300, float('nan')):
-        assert integer_warning('it', 0.0, value) is None
 
 
 def with_integer(message, value):

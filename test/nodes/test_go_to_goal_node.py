@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 from geometry_msgs.msg import Twist, TwistStamped
 from std_srvs.srv import Trigger
@@ -23,7 +22,7 @@ from support.lockstep_nodes import (
 )
 from support.ros_messages import goal, goals, instants, odometry, spoiled, twists
 
-from diffdrive_jacobian.control import VelocityLimits, go_to_goal, saturate
+from diffdrive_jacobian.control import VelocityLimits, saturate
 
 
 @pytest.fixture
@@ -47,16 +46,6 @@ def test_without_a_goal_it_is_silent(lockstep, controller):
     controller.send(goal(3, 0))
     assert controller.at(1, 0) == (1.0, 0.0)
     assert len(controller.commands) == 3
-
-
-def test_goal_where_the_robot_is_succeeds_at_once(controller):
-    controller.send(goal(-0.0199, 0.0, stamp=7))
-    assert controller.at(0.0, 0.0, -3.0) == (0.0, 0.0)
-    assert controller.statuses == [(7, ACCEPTED), (7, EXECUTING), (7, SUCCEEDED)]
-    assert controller.node.waypoint is None
-    controller.send(goals(*[goal(1, 1)] * 50))
-    assert controller.at(1.0, 1.0) == (0.0, 0.0)
-    assert controller.statuses[-1] == (0, SUCCEEDED)
 
 
 def test_tolerances_determine_the_arrival_and_change_live(controller):
@@ -147,27 +136,6 @@ def test_limits_keep_the_curvature_and_change_live(controller):
         free = controller.at(0, 0)
         assert change(controller.node, **values).successful
         assert controller.at(0, 0) == pytest.approx(saturate(*free, limits, 1.0, 1.0))
-
-
-def test_far_goals_ask_for_nothing_that_a_robot_would_drop(controller):
-    for distance in (3e3, 9e5):
-        controller.send(goal(distance, distance))
-        v, omega = controller.at(0, 0)
-        wanted_v, wanted_omega = go_to_goal([0, 0, 0], [distance, distance], 3.0, 0.5)
-        assert v == 1000.0
-        assert omega / v == pytest.approx(wanted_omega / wanted_v, rel=1e-12)
-
-
-def test_stamped_commands_carry_the_time(lockstep):
-    controller = Controller(lockstep, TwistStamped, enable_stamped_cmd_vel=True)
-    controller.send(goal(1, 0))
-    sent = []
-    for x in np.linspace(0.0, 1.0, 3):
-        controller.at(x, 0)
-        sent.append(lockstep.now)
-        lockstep.run_for(0.123)
-    assert instants(controller.commands) == sent
-    assert {one.header.frame_id for one in controller.commands} == {''}
 
 
 # --- Goals that are refused

@@ -24,7 +24,6 @@ from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.plots.run_figure import figure
 from diffdrive_jacobian.plots.run_table import write_csv
-from diffdrive_jacobian.recording.recording import open_recording
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.drive_to import main
 
@@ -45,13 +44,6 @@ def test_a_robot_that_still_moves_is_not_said_to_have_stopped(capsys):
     out = capsys.readouterr().out
     assert 'arrived: the robot still moved at x' in out
     assert 'the robot rolled out of the tolerance of 0.02 m' in out
-
-
-def test_a_path_that_turns_back_is_driven_to_its_end():
-    there_and_back = Path(np.array([(0.0, 0.0), (0.15, 0.0), (0.3, 0.0), (0.15, 0.0), (0.0, 0.0)]))
-    outcome = drive(there_and_back, lockstep=True, timeout=60.0, parameters={'path_speed': 0.4})
-    assert outcome.arrived
-    assert outcome.seconds > 1.4
 
 
 def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
@@ -78,6 +70,10 @@ def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
         *_, row = (row for row in csv.DictReader(file) if row['path_progress_m'])
     assert float(row['path_progress_m']) == pytest.approx(planned.length, abs=0.021)
     assert (row['along_path_m'], row['distance_m']) == ('', '')
+    # The table is a trajectory that can be driven again.
+    again = planned_path(str(tmp_path / 'run.csv'))
+    assert again.length == pytest.approx(planned.length, abs=0.03)
+    assert again.duration == pytest.approx(np.ptp(one.run.odometry.stamps) / 1e9)
     plane, *panels = figure([one.run]).axes
     assert [panel.get_ylabel() for panel in panels[:2]] == ['across path [m]', 'heading to path [rad]']
     assert any(np.allclose(np.ptp(line.get_data(), axis=1), 0.3, atol=1e-3) for line in plane.lines)
@@ -87,25 +83,6 @@ def test_the_true_distance_of_a_robot_that_drifts_is_reported(capsys):
     arguments = ['--path', 'line:0.1', '--lockstep', '--no-record', '--ros-args', '-p']
     assert main([*arguments, 'simulate_slip:=true'], Signals()) == 0
     assert re.search(r'm from it by odometry, truly 0\.\d+ m from its end', capsys.readouterr().out)
-
-
-def test_a_run_of_a_table_can_be_driven_again(tmp_path):
-    """The CSV of a run is a trajectory, and the new run has errors along it."""
-    recording = open_recording('drive', str(tmp_path / 'bag'), 'mcap', lossless=True, replace=False)
-    how = {'path_controller': 'kanayama'}
-    outcome = drive(line_path(0.6).timed(0.3), lockstep=True, parameters=how, recording=recording)
-    recording.finish()
-    assert outcome.arrived
-    assert outcome.seconds == pytest.approx(2.0, abs=0.3)
-    run = read_run(tmp_path / 'bag')
-    one = timeline(run)
-    late = one.progress > 0.4
-    assert late.any()
-    assert abs(one.along[late]).max() < 0.03
-    write_csv(run, tmp_path / 'run.csv')
-    again = planned_path(str(tmp_path / 'run.csv'))
-    assert again.length == pytest.approx(0.6, abs=0.03)
-    assert again.duration == pytest.approx(np.ptp(run.odometry.stamps) / 1e9)
 
 
 def test_a_shape_begins_at_the_robot():
@@ -184,6 +161,14 @@ def test_a_path_counts_until_it_has_ended_or_a_goal_replaces_it(tmp_path, extra)
     run = run_of(tmp_path, [(11.0, '/path', ROUTE), *extra], **STRAIGHT)
     assert paths_of(run) == [(0.0, -1), (1.0, 0), (2.0, -1)]
     assert (timeline(run).goal >= 0).sum() == (100 if extra[0][1] == '/goal_pose' else 0)
+
+
+def test_errors_along_a_trajectory_are_those_at_its_times(tmp_path):
+    """The robot is at x = 0.5 m then and drives at 0.5 m/s, as the trajectory does, but ahead of it."""
+    trajectory = path((0.4, 0.0), (1.4, 0.0), times=[11.0, 13.0])
+    one = timeline(run_of(tmp_path, [(11.0, '/path', trajectory)], **STRAIGHT))
+    along = one.along[(one.time > 1.1) & (one.time < 2.5)]
+    assert along == pytest.approx(np.full(len(along), 0.1), abs=1e-6)
 
 
 def test_a_path_that_was_refused_or_is_none_never_counts(tmp_path):

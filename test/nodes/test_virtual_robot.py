@@ -241,16 +241,6 @@ def test_limits_keep_the_curvature(lockstep, add):
             assert twists(heard[name].applied)[-1] == expected
 
 
-def test_limits_apply_to_the_running_command_and_raised_again_they_give_it_back(lockstep, driving):
-    for limit in (0.25, math.nan):
-        lockstep.run_for(0.2)
-        assert change(driving.robot, linear__x__max_velocity=limit).successful
-    lockstep.run_for(0.2)
-    assert twists(driving.applied) == [(1.0, 0.0), (0.25, 0.0), (1.0, 0.0), (0.0, 0.0)]
-    assert instants(driving.applied) == [SECOND * tenth // 10 for tenth in (10, 12, 14, 15)]
-    assert pose_of(driving.odom[-1]) == pytest.approx([0.2 + 0.05 + 0.1, 0.0, 0.0], abs=1e-15)
-
-
 # --- Changes
 
 
