@@ -244,17 +244,6 @@ def test_limits_keep_the_curvature(lockstep, add):
 # --- Changes
 
 
-@pytest.mark.parametrize(('timeout', 'strikes'), [(0.1, 0.2), (0.7, 0.7), (0.0, None)])
-def test_timeout_changes_for_the_running_command(lockstep, driving, timeout, strikes):
-    lockstep.run_for(0.2)
-    assert change(driving.robot, cmd_vel_timeout=timeout).successful
-    lockstep.run_for(0.8)
-    # It counts from the command; one that is over strikes at once.
-    stops = [] if strikes is None else [SECOND + round(strikes * SECOND)]
-    assert instants(driving.applied) == [SECOND, *stops]
-    assert pose_of(driving.odom[-1])[0] == pytest.approx(strikes or 1.0, abs=1e-15)
-
-
 @pytest.mark.parametrize('rate', [0.5, 1000.0])
 def test_rate_changes_at_once(lockstep, driving, rate):
     lockstep.run_for(0.013)

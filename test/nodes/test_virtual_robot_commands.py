@@ -134,25 +134,6 @@ def test_late_wheel_speeds_act_from_their_stamp_on(lockstep, robot_at):
 
 
 @late
-def test_timeout_strikes_at_its_own_time_whatever_the_rate(lockstep, add):
-    settings = {'a': (1e-10, 50.0), 'b': (0.0333, 50.0), 'c': (0.5, 3.0)}
-    robots = {name: Topics(lockstep, name) for name in settings}
-    for name, (timeout, rate) in settings.items():
-        add(VirtualRobot, name, cmd_vel_timeout=timeout, publish_rate=rate)
-        lockstep.publish(f'{name}/cmd_vel', twist(1.0, -3.0))
-    lockstep.run_for(0.9)
-    for name, (timeout, _) in settings.items():
-        topics = robots[name]
-        # The shortest one is not for ever.
-        held = max(round(timeout * SECOND), 1)
-        assert instants(topics.applied) == [BEGIN, BEGIN + held]
-        assert twists(topics.applied) == [(1.0, -3.0), (0.0, 0.0)]
-        driven = se2.integrate(3 * [0.0], [1.0, -3.0], held / SECOND)
-        assert topics.odom[-1].pose.pose == pose_message(driven)
-        assert at_rest(topics.odom[-1])
-
-
-@late
 def test_a_command_at_the_time_of_the_timeout_loses_no_distance_and_zero_stops_at_once(
     lockstep, driving
 ):
