@@ -159,3 +159,10 @@ def test_what_does_not_fit_a_law_is_warned_about_at_the_start_and_live(
     for changes, warnings in [*steps, (others, set()), (values, {expected})]:
         assert change(node, **changes).successful
         assert warned() == warnings
+
+
+def test_a_robot_that_may_not_drive_forward_or_turn_is_warned_about(lockstep, capfd):
+    node = lockstep.add(make(GoToGoal, linear__x__max_velocity=0.0))
+    assert 'linear.x.max_velocity is 0: the robot may not drive forward' in capfd.readouterr().err
+    assert change(node, angular__z__min_velocity=0.0).successful
+    assert 'the robot may turn in one direction only or not at all' in capfd.readouterr().err

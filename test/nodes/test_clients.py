@@ -35,7 +35,7 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
-from diffdrive_jacobian.ros.service_client import LONGEST_STEP, PERIOD, Liveness
+from diffdrive_jacobian.ros.service_client import LONGEST_STEP, PENDING, PERIOD, Liveness
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import send_goal as sending
 
@@ -173,6 +173,11 @@ def test_a_node_that_is_not_served_falls_silent_and_comes_back(ros, clock, watch
         served += 1
         ros.executor.spin_once(timeout_sec=0.001)
     assert (SILENCE - LONGEST_STEP) / 0.1 - 2 <= served <= SILENCE / 0.1 + 2
+    # Requests do not pile up.
+    for _ in range(2 * PENDING):
+        clock.now += 1.0
+        watch.silence()
+    assert len(watch._clients['/go_to_goal']._pending_requests) == PENDING
     ros.executor.add_node(node)
     answered(ros, watch, clock)
 
