@@ -91,6 +91,7 @@ def test_every_parameter_is_described_as_declared(add, name):
 # --- What is refused
 
 CHOICES = "'controller' must be one of 'go_to_goal', 'offset_point', 'pose', got "
+GAINS = 'kp', 'kv', 'xy_goal_tolerance'
 BAD = {
     'virtual_robot': [
         ({'wheel_radius': 0.0}, "'wheel_radius' must be in [0.001, 10], got 0.0"),
@@ -111,7 +112,7 @@ BAD = {
         *(({'controller': bad}, "'controller'") for bad in (2.0, ['pose'])),
         *(({'controller': 'offset_point', 'offset': bad}, 'rank 1') for bad in (0.0, -0.0009)),
         *(({'offset': bad}, "'offset' must be in") for bad in (math.nan, 101.0)),
-        *(({name: bad}, f"'{name}'") for name in ('kp', 'kv') for bad in (0.0, math.nan, 101.0)),
+        *(({name: bad}, f"'{name}'") for name in GAINS for bad in (0.0, math.nan, 101.0)),
     ],
 }
 
