@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 import struct
 
 import pytest
@@ -20,7 +19,6 @@ from support.lockstep_nodes import ABORTED, ACCEPTED, CANCELED, EXECUTING, Contr
 from support.ros_messages import (
     goal,
     goals,
-    joint_command,
     odometry,
     placement,
     stamp,
@@ -29,17 +27,15 @@ from support.ros_messages import (
 )
 
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
-from diffdrive_jacobian.nodes import go_to_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.ros import node, serialization
-from diffdrive_jacobian.ros.rate_limit import TokenBucket
 
 MEGABYTE = 1_000_000 * 'f'
-FLOOD = 60
-MOST_LINES = 40
+FLOOD = 40
+MOST_LINES = 30
 """More than EVENT_BURST lines, and what EVENT_PERIOD adds on a slow machine."""
 
 
@@ -54,37 +50,14 @@ def assert_a_few(capfd, *words):
         assert node.EVENT_BURST <= written.count(one) <= MOST_LINES, one
 
 
-def test_a_token_bucket_permits_a_burst_and_then_a_rate():
-    limit = TokenBucket(3, 0.5)
-    assert [limit.permits(10.0) for _ in range(5)] == [True, True, True, False, False]
-    assert [limit.permits(10.25), limit.permits(10.5), limit.permits(10.5)] == [False, True, False]
-    assert [limit.permits(99.0) for _ in range(4)] == [True, True, True, False]
-
-
-@pytest.mark.parametrize(
-    ('flood', 'words', 'statuses'),
-    [
-        (lambda number: goal(1, 0, stamp=number), 'goal accepted: ', (ACCEPTED, CANCELED)),
-        (lambda number: goal(9e9, 0, stamp=number), 'goal refused: ', (ABORTED,)),
-        (lambda number: goals(stamp=number), 'goal refused: ', (ABORTED,)),
-    ],
-    ids=['accepted', 'refused', 'refused goals'],
-)
-def test_flood_of_goals_has_a_status_each_and_a_few_log_lines(controller, capfd, flood, words, statuses):
+def test_flood_of_goals_has_a_status_each_and_a_few_log_lines(controller, capfd):
     for number in range(1, FLOOD):
-        controller.send(flood(number))
-    assert_a_few(capfd, words)
+        controller.send(goal(1, 0, stamp=number))
+        controller.send(goal(9e9, 0, stamp=1000 + number))
+    assert_a_few(capfd, 'goal accepted: ', 'goal refused: ')
     for number in range(1, FLOOD - 1):
-        assert [status for stamp, status in controller.statuses if stamp == number] == list(statuses)
-
-
-def test_each_goal_of_a_person_is_logged(controller, capfd):
-    for number in range(1, node.EVENT_BURST + 1):
-        controller.send(goal(number, 0))
-        controller.sees(odometry(number, 0, 0))
-    written = capfd.readouterr().err
-    assert len(re.findall('goal accepted', written)) == node.EVENT_BURST
-    assert len(re.findall('goal reached', written)) == node.EVENT_BURST
+        statuses = [status for stamp, status in controller.statuses if stamp in (number, 1000 + number)]
+        assert statuses == [ACCEPTED, ABORTED, ACCEPTED, CANCELED]
 
 
 def test_events_of_the_controller_are_logged_a_few_times(lockstep, controller, capfd):
@@ -109,20 +82,16 @@ def test_events_of_the_robot_and_the_bridge_are_logged_a_few_times(lockstep, add
     add(WheelBridge, cmd_vel_timeout=0.001)
     for number in range(FLOOD):
         lockstep.publish('initialpose', placement(number))
-    assert_a_few(capfd, 'pose set to')
-    for _ in range(FLOOD):
         lockstep.publish('cmd_vel', twist(1, 0))
         lockstep.run_for(0.002)
-    assert_a_few(capfd, 'the wheels are stopped')
-    for _ in range(FLOOD):
-        lockstep.jump(-0.001)
-    assert_a_few(capfd, 'time went back')
+        lockstep.jump(-0.003)
+    assert_a_few(capfd, 'pose set to', 'the wheels are stopped', 'time went back')
 
 
 # --- Quoted text
 
 
-@pytest.mark.parametrize('text', [MEGABYTE, 5_000 * '\x1b[31m', 5_000 * '\n', 5_000 * '\u202e'])
+@pytest.mark.parametrize('text', [MEGABYTE, 5_000 * '\x1b[31m\n\u202e'])
 def test_long_frames_are_quoted_in_short(lockstep, controller, capfd, text):
     lockstep.add(VirtualRobot())
     controller.sees(odometry(0, 0, 0, frame=text))
@@ -132,7 +101,6 @@ def test_long_frames_are_quoted_in_short(lockstep, controller, capfd, text):
     controller.send(goal(1, 0))
     controller.sees(odometry(0, 0, 0, frame=text))
     controller.sees(odometry(0, 0, 0, frame='other'))
-    controller.sees(odometry(0, 0, 0, frame=text[1:]))
     lockstep.publish('initialpose', placement(0, frame=text))
     written = capfd.readouterr().err
     for words in ('in the frame of the', 'in one frame, got', 'it must stay in frame', 'frame must be'):
@@ -155,33 +123,28 @@ def test_long_and_many_joint_names_are_quoted_in_short(lockstep, add, capfd):
 def test_long_strings_are_refused_as_parameters(lockstep, add_complete):
     robot = add_complete(VirtualRobot)
     value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=10 * MEGABYTE)
-    for name in ('odom_frame_id', 'left_wheel_name'):
-        request = SetParameters.Request(parameters=[ParameterMessage(name=name, value=value)])
-        (result,) = lockstep.call(SetParameters, 'virtual_robot/set_parameters', request).results
-        assert not result.successful
-        assert f"'{name}' must be not empty and at most 256 characters, got 'fff" in result.reason
-        assert result.reason.endswith("...' (10000000 characters)")
-        assert len(result.reason) < 300
-        assert change(robot, **{name: 256 * 'n'}).successful
-        assert not change(robot, **{name: 257 * 'n'}).successful
-    with pytest.raises(ParameterError, match=r"got 'fff.*\.\.\.' \(1000000 characters\)") as caught:
-        GoToGoalParameters(controller=MEGABYTE)
-    assert len(str(caught.value)) < 300
-    with pytest.raises(ParameterError) as caught:
-        GoToGoalParameters(kp=MEGABYTE)
-    assert len(str(caught.value)) < 300
+    request = SetParameters.Request(parameters=[ParameterMessage(name='odom_frame_id', value=value)])
+    (result,) = lockstep.call(SetParameters, 'virtual_robot/set_parameters', request).results
+    assert not result.successful
+    assert "'odom_frame_id' must be not empty and at most 256 characters, got 'fff" in result.reason
+    assert result.reason.endswith("...' (10000000 characters)")
+    assert len(result.reason) < 300
+    assert change(robot, odom_frame_id=256 * 'n').successful
+    assert not change(robot, odom_frame_id=257 * 'n').successful
+    for name in ('controller', 'kp'):
+        with pytest.raises(ParameterError) as caught:
+            GoToGoalParameters(**{name: MEGABYTE})
+        assert len(str(caught.value)) < 300
 
 
 # --- Long goals
 
 
-def test_goals_with_too_many_poses_are_refused_unread(controller, monkeypatch, capfd):
+def test_goals_with_too_many_poses_are_refused(controller, capfd):
     controller.send(goal(1, 0, stamp=1))
     controller.at(0, 0)
     message = goals(*[goal(1, 0)] * (MAX_WAYPOINTS + 1), stamp=2)
-    with monkeypatch.context() as patched:
-        patched.setattr(go_to_goal, '_read_goals', None)
-        controller.send(message)
+    controller.send(message)
     words = f'goals must contain at most {MAX_WAYPOINTS} poses, got {MAX_WAYPOINTS + 1}'
     assert words in capfd.readouterr().err
     assert controller.statuses[-2:] == [(2, ABORTED), (1, EXECUTING)]
@@ -191,7 +154,7 @@ def test_goals_with_too_many_poses_are_refused_unread(controller, monkeypatch, c
 
 
 def test_header_of_goals_is_read_without_the_poses():
-    frames = '', 'a', 'abc', 'abcd', 'äöü', 'a longer frame'
+    frames = '', 'a', 'abcd', 'äöü', 'a longer frame'
     for frame, count in itertools.product(frames, (0, 1, 3)):
         message = goals(*[goal(1, 0, frame='x')] * count, frame=frame)
         message.header.stamp = stamp(-5_000_000_123)
@@ -208,21 +171,12 @@ def big_endian_goals(count):
     return b'\0\2\0\0' + header + struct.pack('>I', count) + bytes(72 * count)
 
 
-def test_long_goals_in_another_byte_order_are_not_converted(lockstep, monkeypatch, capfd):
+def test_bytes_that_are_no_goals_or_too_many_to_convert_are_dropped(lockstep, controller, capfd):
     assert serialization.poses_header(big_endian_goals(10), Goals) == (Time(sec=2), 10)
-    controller = Controller(lockstep)
     publisher = lockstep.node.create_publisher(Goals, 'goals', 10)
-    with monkeypatch.context() as patched:
-        patched.setattr(serialization, '_read_header', None)
-        publisher.publish(big_endian_goals(MAX_WAYPOINTS + 1000))
-        lockstep.settle()
-    assert 'goals dropped: a Goals message must have at most 200000 bytes' in capfd.readouterr().err
-    assert controller.statuses == []
-
-
-def test_bytes_that_are_no_goals_are_dropped(lockstep, controller):
-    publisher = lockstep.node.create_publisher(Goals, 'goals', 10)
+    publisher.publish(big_endian_goals(MAX_WAYPOINTS + 1000))
     lockstep.settle()
+    assert 'goals dropped: a Goals message must have at most 200000 bytes' in capfd.readouterr().err
     for data in (
         b'',
         b'\0\1\0\0',
@@ -242,27 +196,16 @@ def test_bytes_that_are_no_goals_are_dropped(lockstep, controller):
 # --- Invalid stamps
 
 
-STAMPED = {'enable_stamped_cmd_vel': True}
-
-
 @pytest.mark.parametrize(
-    ('node_class', 'parameters', 'answers', 'topic', 'message'),
-    [
-        (
-            *(VirtualRobot, {'command_interface': 'wheels'}, (TwistStamped, 'cmd_vel_out')),
-            *('joint_command', joint_command(10.0, 10.0)),
-        ),
-        (VirtualRobot, STAMPED, (TwistStamped, 'cmd_vel_out'), 'cmd_vel', twist_stamped(1.0, 0.0, 0)),
-        (WheelBridge, STAMPED, (JointState, 'joint_command'), 'cmd_vel', twist_stamped(1.0, 0.0, 0)),
-    ],
+    ('node_class', 'kind', 'topic'),
+    [(VirtualRobot, TwistStamped, 'cmd_vel_out'), (WheelBridge, JointState, 'joint_command')],
 )
-def test_negative_stamp_is_not_taken_for_none(
-    lockstep, add, capfd, node_class, parameters, answers, topic, message
-):
-    answered = lockstep.listen(*answers)
-    add(node_class, **parameters)
+def test_negative_stamp_is_not_taken_for_none(lockstep, add, capfd, node_class, kind, topic):
+    answered = lockstep.listen(kind, topic)
+    add(node_class, enable_stamped_cmd_vel=True)
+    message = twist_stamped(1.0, 0.0, 0)
     # Together they are zero, which would mean that the command has no stamp.
     message.header.stamp.sec, message.header.stamp.nanosec = -1, 1_000_000_000
-    lockstep.publish(topic, message)
+    lockstep.publish('cmd_vel', message)
     assert answered == []
     assert 'command dropped: its stamp must have sec of at least 0' in capfd.readouterr().err

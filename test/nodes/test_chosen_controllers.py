@@ -5,45 +5,32 @@ from __future__ import annotations
 import itertools
 import math
 
-import numpy as np
 import pytest
 from support.lockstep_nodes import (
     ACCEPTED,
     EXECUTING,
-    QUICK,
     SUCCEEDED,
     Controller,
-    Topics,
-    add_team,
-    arrives,
     change,
     make,
 )
-from support.ros_messages import goal, goals, pose_of, twists
+from support.ros_messages import goal, goals
 
 from diffdrive_jacobian.control import (
-    Arrival,
     VelocityLimits,
-    Waypoints,
     go_to_goal,
     go_to_pose,
     offset_point,
     saturate,
     turn_in_place,
 )
-from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.parameters.declaration import ParameterError
 
 LAWS = {
     'go_to_goal': lambda pose, to, kp, kv, d: go_to_goal(pose, to[:2], kp, kv),
     'offset_point': lambda pose, to, kp, kv, d: offset_point(pose, to[:2], kv, d),
     'pose': lambda pose, to, kp, kv, d: go_to_pose(pose, to, kp, kv),
 }
-PAIRS = list(itertools.permutations(LAWS, 2))
-NEXT = [('go_to_goal', 'offset_point'), ('offset_point', 'pose'), ('pose', 'go_to_goal')]
-"""A change to each of them, and from each."""
 POSES = [(0.0, 0.0, 0.0), (2.0, 0.5, math.pi), (-1.0, -0.3, 1.5), (0.9, 1.2, -2.5), (-1e5, 1e5, 1.0)]
 PLAUSIBLE = VelocityLimits(min_v=-1e3, max_v=1e3, min_omega=-1e3, max_omega=1e3)
 
@@ -78,49 +65,36 @@ def test_each_odometry_is_answered_by_the_law_chosen_at_the_start(lockstep, name
 def test_the_command_after_a_switch_is_the_new_laws_and_the_goal_goes_on(lockstep):
     controller = Controller(lockstep)
     controller.send(goal(1.0, 0.4, 2.0))
-    for pose, names in itertools.product(POSES[:4], PAIRS):
+    for names in itertools.permutations(LAWS, 2):
         for name, gains in zip(names, ((3.0, 0.5, 0.1), (7.0, 2.0, -0.4)), strict=True):
             values = dict(zip(('kp', 'kv', 'offset'), gains, strict=True))
             assert change(controller.node, controller=name, **values).successful
-            expected = LAWS[name](pose, (1.0, 0.4, 2.0), *gains)
-            assert controller.at(*pose) == pytest.approx(expected, rel=1e-9)
+            expected = LAWS[name](POSES[2], (1.0, 0.4, 2.0), *gains)
+            assert controller.at(*POSES[2]) == pytest.approx(expected, rel=1e-9)
     assert controller.statuses == [(0, ACCEPTED), (0, EXECUTING)]
-
-
-def test_gains_and_limits_at_the_ends_of_their_range_give_finite_commands(lockstep):
-    controller, smallest = Controller(lockstep, offset=0.001), 5e-324
-    gains = [(100.0, smallest), (smallest, 100.0), (100.0, 100.0)]
-    for name, (kp, kv) in itertools.product(LAWS, gains):
-        controller.send(goal(1e6, -1e6, 2.0))
-        assert change(controller.node, controller=name, kp=kp, kv=kv).successful
-        assert all(map(math.isfinite, controller.at(-1e6, 1e6, 1.0))), (name, kp, kv)
-    limits = 'linear__x__max_velocity', 'angular__z__max_velocity'
-    for name, limit in itertools.product(LAWS, limits):
-        controller.send(goal(5.0, 3.0))
-        values = {**dict.fromkeys(limits, math.nan), limit: smallest}
-        assert change(controller.node, controller=name, kp=100.0, kv=50.0, **values).successful
-        assert all(map(math.isfinite, controller.at(0.0, 0.0))), (name, limit)
 
 
 # --- Where a goal is reached
 
 
-@pytest.mark.parametrize(('first', 'second'), NEXT)
-def test_what_counts_as_arrived_is_switched_too(lockstep, first, second):
-    controller = Controller(lockstep, controller=first, offset=0.5)
+def test_what_counts_as_arrived_is_switched_too(lockstep):
+    controller = Controller(lockstep, offset=0.5)
     axle, ahead = (1.0, 0.0, 0.0), (0.5, 0.0, 0.0)
-    controller.send(goal(*axle))
-    assert controller.at(*(axle if first == 'offset_point' else ahead)) != (0.0, 0.0)
-    assert change(controller.node, controller=second).successful
-    assert controller.at(*(ahead if second == 'offset_point' else axle)) == (0.0, 0.0)
-    assert controller.statuses[-1] == (0, SUCCEEDED)
+    for first, second in itertools.permutations(LAWS, 2):
+        assert change(controller.node, controller=first).successful
+        controller.send(goal(*axle))
+        assert controller.at(*(axle if first == 'offset_point' else ahead)) != (0.0, 0.0)
+        assert change(controller.node, controller=second).successful
+        arrived = controller.at(*(ahead if second == 'offset_point' else axle)) == (0.0, 0.0)
+        assert arrived, (first, second)
+        assert controller.statuses[-1] == (0, SUCCEEDED)
 
 
 @pytest.mark.parametrize('name', LAWS)
 def test_where_the_heading_counts_the_robot_turns_in_place_at_the_end(lockstep, name):
     controller = Controller(lockstep, controller=name, offset=0.5, yaw_goal_tolerance=0.1)
     x = 0.5 if name == 'offset_point' else 1.0
-    for use, heading in itertools.product((True, False), (-2.0, math.pi, 0.5)):
+    for use, heading in itertools.product((True, False), (-2.0, math.pi)):
         assert change(controller.node, use_goal_heading=use).successful
         controller.send(goals(goal(0.0, 9.0, 1.0), goal(1.0, 0.0, heading)))
         controller.at(*point((0.0, 9.0, math.pi / 2.0), x - 1.0), math.pi / 2.0)
@@ -136,124 +110,25 @@ def test_where_the_heading_counts_the_robot_turns_in_place_at_the_end(lockstep, 
         assert controller.statuses[-1] == (0, SUCCEEDED)
 
 
-# --- Drives through all three nodes
-
-
 @pytest.mark.parametrize(
-    ('name', 'use_heading'), [('go_to_goal', True), ('offset_point', False), ('pose', False)]
-)
-def test_a_robot_is_driven_as_by_the_pure_functions(lockstep, name, use_heading):
-    topics, start, target = Topics(lockstep), (0.0, 0.0, math.pi), (0.5, 0.3, -2.0)
-    gains = {'kp': 12.0, 'kv': 4.0, 'offset': 0.2}
-    add_team(lockstep, pose=start, controller=name, use_goal_heading=use_heading, **gains)
-    topics.odom.clear()
-    lockstep.publish('goal_pose', goal(*target))
-    arrives(lockstep, topics)
-    assert topics.statuses == [ACCEPTED, EXECUTING, SUCCEEDED]
-    takes_heading = use_heading or name == 'pose'
-    arrival = Arrival(use_heading=takes_heading, offset=0.2 if name == 'offset_point' else 0.0)
-    here, way = np.array(start), Waypoints(np.array([target]))
-    for odometry in topics.odom[: len(topics.commands)]:
-        difference = here - pose_of(odometry)
-        assert [*difference[:2], se2.wrap_angle(difference[2])] == pytest.approx([0, 0, 0], abs=1e-9)
-        way, command = way.follow(
-            here, lambda pose, to: LAWS[name](pose, to, *gains.values()), arrival, 12.0
-        )
-        here = here if command is None else se2.integrate(here, command, 0.02)
-    assert command is None
-    x, y, theta = pose_of(topics.odom[-1])
-    assert math.dist(point((x, y, theta), arrival.offset), target[:2]) <= 0.02
-    assert (abs(se2.wrap_angle(theta - target[2])) <= 0.02) == takes_heading
-
-
-# --- Changes during the turn in place at the end
-
-HEADING = 3.0
-
-
-@pytest.fixture
-def turning(lockstep):
-    """Start a turn in place at a goal with a controller; return topics, node and goal."""
-
-    def start(controller):
-        topics = Topics(lockstep)
-        lockstep.add(make(VirtualRobot))
-        # The robot turns slowly, so that there is time for a change.
-        slowly = {'use_goal_heading': True, 'angular__z__max_velocity': 1.0}
-        node = lockstep.add(make(GoToGoal, controller=controller, offset=0.3, **slowly, **QUICK))
-        target = point((0.0, 0.0, 0.0), 0.3 if controller == 'offset_point' else 0.0)
-        lockstep.publish('goal_pose', goal(*target, HEADING))
-        lockstep.run_for(1.0)
-        assert set(twists(topics.commands)) == {(0.0, 1.0)}
-        return topics, node, target
-
-    return start
-
-
-@pytest.mark.parametrize(
-    ('before', 'changes', 'after'),
+    ('before', 'changes', 'goes_on'),
     [
-        *((before, {'controller': after}, after) for before, after in [*NEXT, ('go_to_goal', 'pose')]),
-        ('offset_point', {'controller': 'go_to_goal', 'use_goal_heading': False}, 'go_to_goal'),
-        ('offset_point', {'offset': 0.1}, 'offset_point'),
+        ('go_to_goal', {'controller': 'offset_point'}, False),
+        ('offset_point', {'controller': 'pose'}, False),
+        ('offset_point', {'offset': 0.1}, False),
+        ('offset_point', {'odom_timeout': 0.4, 'xy_goal_tolerance': 0.03}, True),
     ],
     ids=str,
 )
-def test_the_robot_is_driven_to_where_it_arrives_now(lockstep, turning, before, changes, after):
-    topics, node, target = turning(before)
-    changed = len(topics.odom)
-    assert change(node, **changes).successful
-    arrives(lockstep, topics)
-    offset = changes.get('offset', 0.3) if after == 'offset_point' else 0.0
-    poses = [pose_of(one) for one in topics.odom[changed:]]
-    distances = [math.dist(point(one, offset), target) for one in poses]
-    assert min(distances) <= 0.02
-    heading_counts = changes.get('use_goal_heading', True)
-    assert not heading_counts or abs(se2.wrap_angle(poses[-1][2] - HEADING)) <= 0.04
-    if after != 'offset_point':
-        # The axle centre stays where it is while the robot turns.
-        assert distances[-1] <= 0.02
-    if {before, after} == {'go_to_goal', 'pose'}:
-        # The same point arrives, and it is there.
-        assert not any(one.linear.x for one in topics.commands)
-
-
-def test_other_changes_do_not_interrupt_the_turn(lockstep, turning):
-    topics, node, _ = turning('offset_point')
-    for values in ({'kp': 25.0}, {'odom_timeout': 0.4}, {'xy_goal_tolerance': 0.03}):
-        assert change(node, **values).successful
-        lockstep.run_for(0.1)
-    arrives(lockstep, topics)
-    assert not any(one.linear.x for one in topics.commands)
-
-
-# --- What is refused
-
-CHOICES = "'controller' must be one of 'go_to_goal', 'offset_point', 'pose', got "
-REFUSED = [
-    *(({'controller': bad}, f'{CHOICES}{bad!r}') for bad in ('', 'Pose', 'mpc')),
-    *(({'controller': bad}, "'controller'") for bad in (1, 2.0, True, ['pose'])),
-    *(({'offset': bad}, "'offset' must be .*rank 1") for bad in (0.0, -0.0, 0.0009, -0.0009)),
-    *(({'offset': bad}, "'offset' must be in") for bad in (math.nan, math.inf, 101.0)),
-    *(({name: bad}, name) for name in ('kp', 'kv') for bad in (0.0, -1.0, math.nan, math.inf, 101.0)),
-]
-
-
-def test_invalid_laws_and_gains_are_refused_at_the_start_and_live(lockstep):
-    controller = Controller(lockstep, controller='offset_point', offset=-0.3)
-    controller.send(goal(1.0, 0.4, 2.0))
-    before, parameters = controller.at(0.0, 0.0), controller.node.parameters
-    for values, words in REFUSED:
-        with pytest.raises(ParameterError, match=words) as caught:
-            make(GoToGoal, **{'controller': 'offset_point', **values})
-        result = change(controller.node, xy_goal_tolerance=0.5, **values)
-        assert not result.successful, values
-        # What rclpy refuses, types and ranges, it describes itself.
-        by_rclpy = result.reason.startswith(('Wrong parameter type', 'Parameter '))
-        assert by_rclpy or result.reason == str(caught.value)
-        assert controller.node.parameters is parameters
-        assert controller.node.get_parameter('controller').value == 'offset_point'
-        assert controller.at(0.0, 0.0) == before
+def test_only_another_driven_point_interrupts_the_turn_at_the_end(lockstep, before, changes, goes_on):
+    controller = Controller(lockstep, controller=before, offset=0.3, use_goal_heading=True)
+    x = 0.7 if before == 'offset_point' else 1.0
+    controller.send(goal(1.0, 0.0, 2.0))
+    turn = pytest.approx((0.0, 6.0))
+    assert controller.at(x, 0.0) == turn
+    assert controller.at(x, 0.1) == turn
+    assert change(controller.node, **changes).successful
+    assert (controller.at(x, 0.1) == turn) == goes_on
 
 
 # --- Warnings
@@ -276,22 +151,18 @@ def test_what_does_not_fit_a_law_is_warned_about_at_the_start_and_live(
         said = capfd.readouterr().err
         return {words for words in (SPIRAL, COAST, BACK) if words in said}
 
-    controller = Controller(lockstep, controller=name, **values)
+    node = lockstep.add(make(GoToGoal, controller=name, **values))
     assert warned() == {expected}
     # Another law has no such limit, or another one.
     other = 'offset_point' if name != 'offset_point' else 'go_to_goal'
-    assert change(controller.node, controller=other).successful
-    assert warned() == set()
-    assert change(controller.node, controller=name).successful
-    assert warned() == {expected}
-    assert change(controller.node, **others).successful
-    assert warned() == set()
-    assert change(controller.node, **values).successful
-    assert warned() == {expected}
+    steps = [({'controller': other}, set()), ({'controller': name}, {expected})]
+    for changes, warnings in [*steps, (others, set()), (values, {expected})]:
+        assert change(node, **changes).successful
+        assert warned() == warnings
 
 
-def test_a_robot_that_may_not_drive_forward_is_warned_about(lockstep, capfd):
-    controller = Controller(lockstep, linear__x__max_velocity=0.0)
-    controller.send(goal(1, 1))
-    assert controller.at(0, 0) == pytest.approx((0.0, 3.0 * math.pi / 4))
+def test_a_robot_that_may_not_drive_forward_or_turn_is_warned_about(lockstep, capfd):
+    node = lockstep.add(make(GoToGoal, linear__x__max_velocity=0.0))
     assert 'linear.x.max_velocity is 0: the robot may not drive forward' in capfd.readouterr().err
+    assert change(node, angular__z__min_velocity=0.0).successful
+    assert 'the robot may turn in one direction only or not at all' in capfd.readouterr().err

@@ -1,9 +1,8 @@
-"""What is silent in ROS is said: forgotten nodes, several publishers, driving by hand, integers."""
+"""What is silent in ROS is reported: forgotten nodes, several publishers, driving by hand, integers."""
 
 from __future__ import annotations
 
 import struct
-import sys
 
 import pytest
 from action_msgs.msg import GoalStatus
@@ -16,11 +15,9 @@ from sensor_msgs.msg import JointState
 from support.lockstep_nodes import ACCEPTED, CANCELED, EXECUTING, SUCCEEDED, Controller, Topics
 from support.ros_messages import goal, goals, joint_command, placement, twist, twists
 
-from diffdrive_jacobian.messages.cdr import integer_warning
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros.graph_faults import Interleaving, LastingFault
 from diffdrive_jacobian.ros.node import FAULT_PATIENCE
 
 WHEELS = {'command_interface': 'wheels'}
@@ -47,72 +44,32 @@ def node(lockstep):
 # --- Faults
 
 
-def test_a_fault_is_reported_once_after_it_has_lasted_and_again_after_it_was_gone():
-    fault = LastingFault(3)
-    present = ['a'] * 5 + [None] + ['a'] * 4 + ['b'] * 2 + ['a'] * 2 + ['b'] * 3
-    reports = [fault.check(one) for one in present]
-    assert [(index, one) for index, one in enumerate(reports) if one] == [(2, 'a'), (8, 'a'), (16, 'b')]
-
-
-def test_alternating_publishers_are_told_by_their_sequence_numbers():
-    def falls(*numbers):
-        commands = Interleaving()
-        for commands.number in numbers:
-            commands.count()
-        found = commands.falls()
-        assert commands.falls() == 0
-        return found
-
-    assert falls() == falls(1, 2, 3, 5, 90) == 0
-    # A publisher that was restarted.
-    assert falls(7, 8, 1, 2, 3) == 1
-    assert falls(1, 1, 2, 2, 3, 3) == 3
-    assert falls(1000, 4, 1001, 5, 1002, 6) == 3
-    # Middleware without sequence numbers.
-    assert falls(None, None) == 0
-
-
 # --- Forgotten nodes
 
 TOPICS = ('odom', 'cmd_vel', 'joint_command', 'goal_pose', 'goals', 'goal_status')
 REMAPPED = [argument for name in TOPICS for argument in ('-r', f'{name}:=my_{name}')]
+CASES = [
+    (GoToGoal, {}, [], 'no node is subscribed to /my_cmd_vel: start virtual_robot'),
+    (GoToGoal, {}, [(Odometry, 'my_odom')] * 2, '(2 times) publish /my_odom: their poses alternate'),
+    (
+        *(GoToGoal, {}, [(GoalStatus, 'my_goal_status')]),
+        '/go_to_goal and /lockstep publish /my_goal_status: two controllers',
+    ),
+    (WheelBridge, {}, [], 'no node is subscribed to /my_joint_command: start virtual_robot with'),
+    (VirtualRobot, WHEELS, [], 'no node publishes /my_joint_command: start wheel_bridge'),
+    (
+        *(VirtualRobot, {}, [(PoseStamped, 'my_goal_pose')]),
+        '/lockstep publishes /my_goal_pose, but no controller is subscribed to it',
+    ),
+    (
+        *(VirtualRobot, {}, [(Odometry, 'my_odom')]),
+        '/lockstep and /virtual_robot publish /my_odom: their poses alternate',
+    ),
+]
 
 
-@pytest.mark.parametrize(
-    ('node_class', 'parameters', 'publishers', 'expected'),
-    [
-        (
-            *(GoToGoal, {}, []),
-            ['no node is subscribed to /my_cmd_vel: start virtual_robot', 'the topic (cmd_vel:=NAME)'],
-        ),
-        (
-            *(GoToGoal, {}, [(Odometry, 'my_odom')] * 2),
-            ['(2 times) publish /my_odom: their poses alternate', 'was killed disappears within 20 s'],
-        ),
-        (
-            *(GoToGoal, {}, [(GoalStatus, 'my_goal_status')]),
-            ['/go_to_goal and /lockstep publish /my_goal_status: two controllers'],
-        ),
-        (
-            *(WheelBridge, {}, []),
-            ['no node is subscribed to /my_joint_command: start virtual_robot with'],
-        ),
-        (VirtualRobot, WHEELS, [], ['no node publishes /my_joint_command: start wheel_bridge']),
-        (
-            *(VirtualRobot, {}, [(PoseStamped, 'my_goal_pose')]),
-            [
-                '/lockstep publishes /my_goal_pose, but no controller is subscribed to it',
-                'goals are lost: start go_to_goal',
-            ],
-        ),
-        (
-            *(VirtualRobot, {}, [(Odometry, 'my_odom')]),
-            ['/lockstep and /virtual_robot publish /my_odom: their poses alternate'],
-        ),
-    ],
-    ids=lambda one: one.__name__ if isinstance(one, type) else '',
-)
-def test_a_missing_or_second_node_is_reported(
+@pytest.mark.parametrize(('node_class', 'parameters', 'publishers', 'expected'), CASES, ids=range(7))
+def test_a_missing_or_second_node_is_reported_once(
     lockstep, node, capfd, node_class, parameters, publishers, expected
 ):
     """By the names of topics after remapping."""
@@ -121,29 +78,23 @@ def test_a_missing_or_second_node_is_reported(
     for kind, name in publishers:
         node.create_publisher(kind, name, 10)
     check(one, FAULT_PATIENCE - 1)
-    text = said(capfd)
-    assert not any(words in text for words in expected)
+    assert expected not in said(capfd)
     check(one, 3 * FAULT_PATIENCE)
-    text = said(capfd)
-    assert [text.count(words) for words in expected] == [1] * len(expected)
+    assert said(capfd).count(expected) == 1
 
 
 def test_nothing_is_reported_of_a_complete_team(lockstep, team, capfd):
-    before = len(list(team.controller.subscriptions))
     lockstep.publish('goals', goals(goal(0.2, 0.0)))
     lockstep.run_until(lambda: team.statuses[-1:] == [SUCCEEDED], 30.0, 'arrival')
     for one in (team.robot, team.bridge, team.controller):
         check(one, 2 * FAULT_PATIENCE)
     assert '[WARN]' not in said(capfd)
-    # The usual pair stays cheap: nothing is created after the start.
-    assert len(list(team.controller.subscriptions)) == before
 
 
 # --- Several drivers
 
 
-@pytest.mark.parametrize('node_class', [VirtualRobot, WheelBridge])
-@pytest.mark.parametrize('stamped', [False, True])
+@pytest.mark.parametrize(('node_class', 'stamped'), [(VirtualRobot, False), (WheelBridge, True)])
 def test_alternating_commands_are_reported_and_zeros_are_not(
     lockstep, add, node, capfd, node_class, stamped
 ):
@@ -175,12 +126,10 @@ def test_driving_by_hand_cancels_the_goal(lockstep, add, node, capfd):
     add(VirtualRobot)
     add(GoToGoal, linear__x__max_velocity=0.5)
     lockstep.publish('goals', goals(goal(50.0, 0.0)))
-    lockstep.run_for(0.5)
-    assert team.statuses[-1] == EXECUTING
+    lockstep.run_for(0.2)
     # As of a joystick that nobody touches.
     joystick = node.create_publisher(Twist, 'cmd_vel', 10)
-    joystick.publish(Twist())
-    lockstep.run_for(1.5)
+    lockstep.run_for(1.1)
     joystick.publish(Twist())
     lockstep.run_for(0.1)
     assert team.statuses[-1] == EXECUTING
@@ -205,11 +154,10 @@ def test_a_controller_beside_an_idle_driver_knows_its_own_commands(lockstep, nod
     node.create_publisher(command, 'cmd_vel', 10)
     controller = Controller(lockstep, command, enable_stamped_cmd_vel=command is TwistStamped)
     controller.send(goals(goal(1.0, 0.3)))
-    for step in range(30):
+    for step in range(10):
         controller.at(0.001 * step, 0.0)
         lockstep.run_for(0.02)
     assert [status for _, status in controller.statuses] == [ACCEPTED, EXECUTING]
-    assert controller.node._others.subscriptions == 1
 
 
 def test_its_own_subscription_is_no_reader_of_a_controller(lockstep, node, add, capfd):
@@ -217,7 +165,7 @@ def test_its_own_subscription_is_no_reader_of_a_controller(lockstep, node, add, 
     controller = add(GoToGoal)
     node.create_publisher(Odometry, 'odom', 10)
     lockstep.publish('goals', goals(goal(1.0, 0.0)))
-    assert controller._others.subscriptions == 1
+    assert node.count_subscribers('/cmd_vel') == 1
     check(controller)
     assert 'no node is subscribed to /cmd_vel' in said(capfd)
 
@@ -233,22 +181,13 @@ def test_a_controller_that_publishes_best_effort_knows_its_own_commands(lockstep
     controller.send(goals(goal(1.0, 0.3)))
     controller.at(0.0, 0.0)
     check(controller.node)
-    text = said(capfd)
-    assert 'no node is subscribed' not in text
-    assert 'incompatible QoS' not in text
+    assert 'incompatible QoS' not in said(capfd)
     joystick.publish(twist(0.25, 0.0))
     lockstep.settle()
-    assert [status for _, status in controller.statuses][-1] == CANCELED
+    assert [status for _, status in controller.statuses] == [ACCEPTED, EXECUTING, CANCELED]
 
 
 # --- Integers
-
-
-def test_integers_in_fields_of_floats_are_told():
-    for integer in (INTEGER, -INTEGER, 4.9e-323):
-        assert integer_warning('it', 0.0, integer) is not None
-    for value in (0.0, 1.0, 1e-300, float('nan')):
-        assert integer_warning('it', 0.0, value) is None
 
 
 def with_integer(message, value):
@@ -286,18 +225,3 @@ def test_an_integer_in_a_message_is_reported_once_and_taken_as_it_is(
     words = f'{expected} has the value 4.94e-324: was an int assigned to a float field?'
     assert said(capfd).count(words) == 1
     assert node_class is not GoToGoal or answers[-1].status == ACCEPTED
-
-
-def test_integers_are_reported_as_this_python_sends_them(lockstep, add, node, capfd):
-    add(VirtualRobot)
-    publisher = node.create_publisher(Twist, 'cmd_vel', 10)
-    for value in (1, 2**40, -1):
-        message = Twist()
-        # As `message.linear.x = value` without the checks of rclpy, which are on in these tests.
-        message.linear._x = value
-        publisher.publish(message)
-        lockstep.settle()
-        text = said(capfd)
-        is_nan = value < 0 and sys.version_info < (3, 12)
-        assert not text or ('must be finite' if is_nan else 'was an int assigned to a float') in text
-        assert text or value != 1

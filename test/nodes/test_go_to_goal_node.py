@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
-from geometry_msgs.msg import Twist, TwistStamped
+from geometry_msgs.msg import Twist
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import (
     ABORTED,
@@ -15,25 +14,14 @@ from support.lockstep_nodes import (
     CANCELED,
     EXECUTING,
     NANOSECOND,
-    SECOND,
     SUCCEEDED,
     Controller,
     change,
     comes_after,
 )
-from support.ros_messages import goal, goals, instants, odometry, spoiled, twists
+from support.ros_messages import goal, goals, odometry, spoiled, twists
 
-from diffdrive_jacobian.control import VelocityLimits, go_to_goal, saturate
-
-BAD_POSES = [
-    ('position.x', math.nan, 'position must be finite'),
-    ('position.y', -math.inf, 'y -inf'),
-    ('position.x', 1.000001e6, 'within 1e+06 m'),
-    ('orientation.w', 0.0, 'got x 0, y 0, z 0, w 0'),
-    ('orientation.w', 1.2, 'quaternion of length 1'),
-    ('orientation.z', math.nan, 'quaternion of length 1'),
-    ('orientation.x', math.inf, 'quaternion of length 1'),
-]
+from diffdrive_jacobian.control import VelocityLimits, saturate
 
 
 @pytest.fixture
@@ -59,18 +47,8 @@ def test_without_a_goal_it_is_silent(lockstep, controller):
     assert len(controller.commands) == 3
 
 
-def test_goal_on_the_own_spot_succeeds_at_once(controller):
-    controller.send(goal(-0.0199, 0.0, stamp=7))
-    assert controller.at(0.0, 0.0, -3.0) == (0.0, 0.0)
-    assert controller.statuses == [(7, ACCEPTED), (7, EXECUTING), (7, SUCCEEDED)]
-    assert controller.node.waypoint is None
-    controller.send(goals(*[goal(1, 1)] * 50))
-    assert controller.at(1.0, 1.0) == (0.0, 0.0)
-    assert controller.statuses[-1] == (0, SUCCEEDED)
-
-
-def test_tolerances_tell_arrived_from_not_yet_and_change_live(controller):
-    for tolerance in (1e-6, 0.5, 100.0):
+def test_tolerances_determine_the_arrival_and_change_live(controller):
+    for tolerance in (1e-6, 100.0):
         assert change(controller.node, xy_goal_tolerance=tolerance).successful
         controller.send(goal(0.0, 0.0))
         assert controller.at(-1.001 * tolerance, 0.0)[0] == pytest.approx(0.5 * 1.001 * tolerance)
@@ -81,20 +59,6 @@ def test_tolerances_tell_arrived_from_not_yet_and_change_live(controller):
     assert controller.at(1, 1, 0.0) == pytest.approx((0.0, 6.0))
     assert change(controller.node, yaw_goal_tolerance=2.1).successful
     assert controller.at(1, 1, 0.0) == (0.0, 0.0)
-
-
-def test_waypoints_are_driven_in_order(controller):
-    controller.send(goals(goal(1, 0), goal(1, 1), goal(0, 1), stamp=3))
-    # Near a later waypoint the one that is due is driven to nevertheless.
-    assert controller.at(0, 1, -math.pi / 4)[0] == pytest.approx(0.5 * math.sqrt(2.0))
-    assert controller.node.waypoint == 0
-    assert controller.at(1.0, 0.0) == pytest.approx((0.0, 3.0 * math.pi / 2), abs=1e-12)
-    assert controller.node.waypoint == 1
-    assert controller.at(1.0, 0.0, math.pi / 2)[0] == pytest.approx(0.5)
-    controller.at(1.0, 1.0, math.pi / 2)
-    assert controller.node.waypoint == 2
-    assert controller.at(0.0, 1.0) == (0.0, 0.0)
-    assert controller.statuses == [(3, ACCEPTED), (3, EXECUTING), (3, SUCCEEDED)]
 
 
 def test_new_goals_replace_the_active_one(controller):
@@ -130,7 +94,7 @@ def test_cancel_sends_zero_and_there_must_be_a_goal(lockstep, controller):
     assert controller.statuses[3:] == [(2, ACCEPTED), (2, CANCELED)]
 
 
-def test_stop_gives_the_goal_up_once(lockstep, controller):
+def test_stop_cancels_the_goal_once(lockstep, controller):
     controller.node.stop('too early')
     controller.send(goal(1, 0))
     controller.at(0, 0)
@@ -144,88 +108,49 @@ def test_stop_gives_the_goal_up_once(lockstep, controller):
 # --- Commands
 
 
-@pytest.mark.parametrize(
-    'limits',
-    [
-        {'max_v': 0.2, 'max_omega': 1.0},
-        {'max_omega': 0.5},
-        {'max_v': 0.1, 'min_v': 0.0, 'max_omega': 2.0, 'min_omega': -0.3},
-    ],
-    ids=str,
-)
-def test_limits_keep_the_curvature_and_change_live(controller, limits):
-    names = {
-        'max_v': 'linear__x__max_velocity',
-        'min_v': 'linear__x__min_velocity',
-        'max_omega': 'angular__z__max_velocity',
-        'min_omega': 'angular__z__min_velocity',
+def test_limits_keep_the_curvature_and_change_live(controller):
+    values = {
+        'linear__x__max_velocity': 0.1,
+        'linear__x__min_velocity': 0.0,
+        'angular__z__max_velocity': 2.0,
+        'angular__z__min_velocity': -0.3,
     }
-    symmetric = {'max_v': math.inf, 'max_omega': math.inf, **limits}
-    for part in ('v', 'omega'):
-        symmetric.setdefault(f'min_{part}', -symmetric[f'max_{part}'])
+    limits = VelocityLimits(max_v=0.1, min_v=0.0, max_omega=2.0, min_omega=-0.3)
     for target in [(5.0, 2.0), (-5.0, 0.1), (0.3, -2.0)]:
         controller.send(goal(*target))
-        assert change(controller.node, **dict.fromkeys(names.values(), math.nan)).successful
+        assert change(controller.node, **dict.fromkeys(values, math.nan)).successful
         free = controller.at(0, 0)
-        values = {names[key]: value for key, value in limits.items()}
         assert change(controller.node, **values).successful
-        expected = saturate(*free, VelocityLimits(**symmetric), 1.0, 1.0)
-        assert controller.at(0, 0) == pytest.approx(expected)
-
-
-def test_far_goals_ask_for_nothing_that_a_robot_would_drop(controller):
-    for distance in (3e3, 9e5):
-        controller.send(goal(distance, distance))
-        v, omega = controller.at(0, 0)
-        wanted_v, wanted_omega = go_to_goal([0, 0, 0], [distance, distance], 3.0, 0.5)
-        assert v == 1000.0
-        assert omega / v == pytest.approx(wanted_omega / wanted_v, rel=1e-12)
-
-
-def test_stamped_commands_carry_the_time(lockstep):
-    controller = Controller(lockstep, TwistStamped, enable_stamped_cmd_vel=True)
-    controller.send(goal(1, 0))
-    sent = []
-    for x in np.linspace(0.0, 1.0, 5):
-        controller.at(x, 0)
-        sent.append(lockstep.now)
-        lockstep.run_for(0.123)
-    assert instants(controller.commands) == sent
-    assert {one.header.frame_id for one in controller.commands} == {''}
+        assert controller.at(0, 0) == pytest.approx(saturate(*free, limits, 1.0, 1.0))
 
 
 # --- Goals that are refused
 
-
-BAD_GOALS = {
-    'poses': [
+BAD_POSES = [
+    ('position.x', math.nan, 'position must be finite'),
+    ('position.x', 1.000001e6, 'within 1e+06 m'),
+    ('orientation.w', 0.0, 'got x 0, y 0, z 0, w 0'),
+    ('orientation.w', 1.2, 'quaternion of length 1'),
+    ('orientation.z', math.nan, 'quaternion of length 1'),
+]
+BAD_GOALS = [
+    *(
         (spoiled(goal(0, 0, stamp=2), f'pose.{field}', value), words)
         for field, value, words in BAD_POSES
-    ],
-    'goals and frames': [
-        (goals(goal(0, 0), goal(0, math.inf), stamp=2), 'y inf'),
-        (goals(stamp=2), 'at least one pose, got none'),
-        (goals(goal(0, 0, frame='a'), goal(0, 0, frame='b'), stamp=2), "one frame, got ['a', 'b']"),
-        (goal(1, 0, frame='map', stamp=2), "the odometry, 'odom' or '' for it, got 'map'"),
-        (goals(goal(1, 0), frame='map', stamp=2), "got 'map'"),
-        (goals(goal(1, 0, frame='map'), goal(1, 0, frame='map'), stamp=2), "got 'map'"),
-    ],
-}
-"""No more of each than are logged at once."""
+    ),
+    (goals(goal(0, 0), goal(0, math.inf), stamp=2), 'y inf'),
+    (goals(stamp=2), 'at least one pose, got none'),
+    (goals(goal(0, 0, frame='a'), goal(0, 0, frame='b'), stamp=2), "one frame, got ['a', 'b']"),
+    (goal(1, 0, frame='map', stamp=2), "the odometry, 'odom' or '' for it, got 'map'"),
+    (goals(goal(1, 0, frame='map'), goal(1, 0, frame='map'), stamp=2), "got 'map'"),
+]
+"""No more than are logged at once."""
 
 
-@pytest.mark.parametrize('kind', BAD_GOALS)
-def test_bad_goals_are_refused_and_the_active_one_goes_on(lockstep, controller, capfd, kind):
-    cases = BAD_GOALS[kind]
-    # Without an active one the node stays silent.
-    for message, words in cases[:2]:
-        controller.send(message)
-        assert controller.sees(odometry(0, 0, 0)) == []
-        assert words in capfd.readouterr().err
-    assert controller.statuses == [(2, ABORTED)] * 2
+def test_bad_goals_are_refused_and_the_active_one_goes_on(lockstep, controller, capfd):
     controller.send(goal(1, 0, frame='odom', stamp=1))
     controller.at(0, 0)
-    for message, words in cases:
+    for message, words in BAD_GOALS:
         controller.send(message)
         assert controller.at(0, 0) == (0.5, 0.0)
         assert controller.statuses[-3:] == [(1, EXECUTING), (2, ABORTED), (1, EXECUTING)]
@@ -235,15 +160,15 @@ def test_bad_goals_are_refused_and_the_active_one_goes_on(lockstep, controller, 
     # Who comes late sees the status of what goes on, too.
     latched = lockstep.listen(type(controller.status[0]), 'goal_status', latched=True)
     assert latched[-1] == controller.status[-1]
+    # Without an active one the node stays silent.
+    controller.at(1, 0)
+    before = len(controller.status)
+    controller.send(BAD_GOALS[0][0])
+    assert controller.sees(odometry(0, 0, 0)) == []
+    assert controller.statuses[before:] == [(2, ABORTED)]
 
 
-def test_frame_may_stand_with_the_pose_or_with_all(controller):
-    for pose_frame, message_frame in (('odom', ''), ('', 'odom'), ('odom', 'odom'), ('', '')):
-        controller.send(goals(goal(1, 0, frame=pose_frame), frame=message_frame))
-        assert controller.at(0, 0) == (0.5, 0.0)
-
-
-def test_frame_is_judged_when_odometry_comes_first_after_the_goal(controller, capfd):
+def test_frame_is_checked_when_odometry_comes_first_after_the_goal(controller, capfd):
     controller.send(goal(1, 0, frame='map', stamp=1))
     assert controller.sees(odometry(0, 0, 0)) == []
     assert controller.statuses == [(1, ACCEPTED), (1, ABORTED)]
@@ -257,10 +182,11 @@ def test_frame_is_judged_when_odometry_comes_first_after_the_goal(controller, ca
     assert controller.statuses[-1] == (3, EXECUTING)
 
 
-def test_frame_may_change_between_goals(controller):
+def test_frame_is_that_of_the_poses_or_of_the_message_and_may_change_between_goals(controller):
     for frame in ('odom', 'map'):
-        controller.send(goal(1, 0, frame=frame))
-        assert controller.at(0, 0, frame=frame) == (0.5, 0.0)
+        for of_pose, of_message in ((frame, ''), ('', frame), (frame, frame), ('', '')):
+            controller.send(goals(goal(1, 0, frame=of_pose), frame=of_message))
+            assert controller.at(0, 0, frame=frame) == (0.5, 0.0)
         assert controller.at(1, 0, frame=frame) == (0.0, 0.0)
         controller.sees(odometry(0, 0, 0, frame='map'))
 
@@ -271,10 +197,7 @@ def test_frame_may_change_between_goals(controller):
 @pytest.mark.parametrize(
     ('message', 'words'),
     [
-        *[
-            (spoiled(odometry(0, 0, 0), f'pose.pose.{field}', value), words)
-            for field, value, words in BAD_POSES[::3]
-        ],
+        (odometry(math.nan, 0, 0), 'position must be finite'),
         (odometry(0, 0, 0, frame='map'), "it must stay in frame 'odom', got 'map'"),
         (odometry(0, 0, 0, frame=''), "it must stay in frame 'odom', got ''"),
     ],
@@ -287,7 +210,7 @@ def test_bad_odometry_is_dropped_and_stops_the_robot_in_time(lockstep, capfd, me
         lockstep.run_for(0.02)
         assert controller.sees(message) == []
     assert comes_after(lockstep, controller.commands, 0.02) == Twist()
-    for _ in range(5):
+    for _ in range(3):
         lockstep.run_for(0.1)
         assert controller.sees(message) == []
     # The goal was kept.
@@ -300,51 +223,8 @@ def test_bad_odometry_is_dropped_and_stops_the_robot_in_time(lockstep, capfd, me
     assert 'odometry is received again: driving on' in said
 
 
-@pytest.mark.parametrize('timeout', [1e-9, 0.3333, 60.0])
-def test_zero_comes_exactly_the_timeout_after_the_last_odometry(lockstep, timeout):
-    controller = Controller(lockstep, TwistStamped, odom_timeout=timeout, enable_stamped_cmd_vel=True)
-    controller.send(goal(1, 0))
-    for _ in range(3):
-        controller.at(0, 0)
-        seen = lockstep.now
-        lockstep.run_for(max(timeout / 3.0, NANOSECOND))
-    lockstep.run_for(10.0 * timeout)
-    driven = zip(instants(controller.commands), twists(controller.commands), strict=True)
-    zeros = [at for at, command in driven if command == (0.0, 0.0)]
-    held = round(timeout * SECOND)
-    assert zeros[-1] == seen + held
-    # Nor any other, but for odometry that comes as seldom as the timeout allows.
-    assert len(zeros) == (1 if held > 1 else 3)
-    # The goal is kept until odometry comes again, however late.
-    lockstep.run_for(1000.0)
-    controller.at(1, 0)
-    assert controller.statuses == [(0, ACCEPTED), (0, EXECUTING), (0, SUCCEEDED)]
-
-
-def test_without_a_timeout_the_last_command_stands(lockstep):
-    controller = Controller(lockstep, odom_timeout=0.0)
-    controller.send(goal(1, 0))
-    controller.at(0, 0)
-    lockstep.run_for(1e5)
-    assert twists(controller.commands) == [(0.5, 0.0)]
-
-
-def test_only_odometry_puts_the_timeout_off(lockstep, controller, capfd):
-    """Neither a new timeout, which counts from the last odometry, nor a new goal."""
-    controller.send(goal(1, 0))
-    controller.at(0, 0)
-    for timeout in (2.0, 0.6):
-        lockstep.run_for(0.1)
-        assert change(controller.node, odom_timeout=timeout).successful
-        controller.send(goal(-1, 0))
-    assert comes_after(lockstep, controller.commands, 0.4) == Twist()
-    lockstep.run_for(5.0)
-    assert len(controller.commands) == 2
-    assert 'no valid odometry on /odom for 0.6 s' in capfd.readouterr().err
-
-
 @pytest.mark.parametrize('timeout', [0.1, 3.0])
-def test_goal_that_waits_for_odometry_says_so_and_commands_nothing(lockstep, capfd, timeout):
+def test_goal_that_waits_for_odometry_is_reported_and_commands_nothing(lockstep, capfd, timeout):
     controller = Controller(lockstep, odom_timeout=timeout)
     controller.send(goal(1, 0))
     lockstep.run_for(timeout - NANOSECOND)
@@ -358,24 +238,16 @@ def test_goal_that_waits_for_odometry_says_so_and_commands_nothing(lockstep, cap
     assert controller.statuses == [(0, ACCEPTED)]
 
 
-def test_robot_that_turns_in_place_is_stopped_too(lockstep):
-    controller = Controller(lockstep, use_goal_heading=True)
+def test_a_new_goal_does_not_put_the_timeout_off_and_turns_in_place_are_stopped_too(
+    lockstep, controller
+):
+    assert change(controller.node, use_goal_heading=True).successful
     controller.send(goal(0, 0, 2.0))
     assert controller.at(0, 0) == pytest.approx((0.0, 6.0))
-    assert comes_after(lockstep, controller.commands, 0.5) == Twist()
-    assert controller.at(0, 0, 1.0) == pytest.approx((0.0, 3.0))
-
-
-@pytest.mark.lockstep(start=100.0)
-@pytest.mark.parametrize('seconds', [-50.0, -0.1, 0.3, 0.5, 1000.0])
-def test_jumps_of_time_stop_the_robot_that_is_not_seen(lockstep, controller, seconds):
-    controller.send(goal(1, 0))
-    controller.at(0, 0)
-    lockstep.jump(seconds)
-    # After a jump back the timeout begins anew.
-    left = 0.5 - max(seconds, 0.0)
-    if left > 0.0:
-        comes_after(lockstep, controller.commands, left)
-    assert twists(controller.commands) == [(0.5, 0.0), (0.0, 0.0)]
-    assert controller.at(0.5, 0.0) == (0.25, 0.0)
-    comes_after(lockstep, controller.commands, 0.5)
+    lockstep.run_for(0.3)
+    controller.send(goal(-1, 0))
+    assert comes_after(lockstep, controller.commands, 0.2) == Twist()
+    # The goal is kept until odometry comes again, however late.
+    lockstep.run_for(1000.0)
+    assert controller.at(-1, 0) == (0.0, 0.0)
+    assert controller.statuses[-2:] == [(0, EXECUTING), (0, SUCCEEDED)]

@@ -7,17 +7,12 @@ import pytest
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import (
-    DescribeParameters,
-    GetParameters,
-    GetParameterTypes,
-    ListParameters,
     SetParameters,
     SetParametersAtomically,
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
-from support.ros_messages import odometry, receive
 from type_description_interfaces.srv import GetTypeDescription
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -75,19 +70,12 @@ def test_value_of_an_unknown_type_is_refused(lockstep, add_complete, name):
     before = node.parameters
     refused = result(double(changed, 2.5), of_type('kv', 10), double(changed, 3.5))
     assert not refused.successful
-    assert "parameter 'kv' must have a type in 0 to 9, got type 10" in refused.reason
-    assert node.parameters is before
+    assert node.parameters == before
     assert result(double(changed, 2.5), double(changed, 3.5)).successful
     assert node.get_parameter(changed).value == 3.5
 
 
-SERVICES = {
-    'describe_parameters': (DescribeParameters, lambda name: {'names': [name]}),
-    'get_parameters': (GetParameters, lambda name: {'names': [name]}),
-    'get_parameter_types': (GetParameterTypes, lambda name: {'names': [name]}),
-    'list_parameters': (ListParameters, lambda name: {'prefixes': [name], 'depth': 2**64 - 1}),
-}
-ODD_NAMES = ['', '.', '..', ' ', '\n', 'kp.', 'kp.kp', 'ü', '%s', '\x00', 1_000 * 'n']
+ODD_NAMES = ['', '.', '\n', 'kp.', 'kp.kp', '%s', '\x00', 1_000 * 'n']
 
 
 def test_odd_names_are_refused_quoted_in_short_and_without_control_characters(
@@ -109,80 +97,41 @@ def test_odd_names_are_refused_quoted_in_short_and_without_control_characters(
     assert (result.successful, result.reason) == (False, 'a parameter must have a name, got none')
     assert not node.has_parameter('')
     assert not any(one.successful for one in results(*(of_type(one, 0) for one in [*ODD_NAMES, 'kp'])))
-    # The other services answer.
-    for name in ODD_NAMES:
-        for service, (kind, fields) in SERVICES.items():
-            assert lockstep.call(kind, f'go_to_goal/{service}', kind.Request(**fields(name)))
-
-
-def test_exception_of_our_own_callbacks_is_not_caught(lockstep, add_complete):
-    node = add_complete(GoToGoal)
-
-    def fail(_):
-        raise ZeroDivisionError('of the node itself')
-
-    node.add_post_set_parameters_callback(fail)
-    request = SetParameters.Request(parameters=[of_type('kp', 10), double('kp', 2.5)])
-    with pytest.raises(ZeroDivisionError, match='of the node itself'):
-        lockstep.call(SetParameters, 'go_to_goal/set_parameters', request)
 
 
 # --- Type descriptions
 
-MALFORMED_HASHES = (
-    *('', 'y' * 100_000, f'RIHS01_{"0" * 63}g'),
-    *(f'RIHS02_{"0" * 64}', f'RIHS01_{"0" * 64}\n'),
-)
+MALFORMED_HASHES = ('', 'y' * 100_000, f'RIHS01_{"0" * 63}g', f'RIHS01_{"0" * 64}\n')
 
 
-@pytest.mark.parametrize('name', [*NODES, 'client'])
-def test_malformed_type_hash_is_refused_and_not_logged(ros, capfd, name):
+def test_malformed_type_hash_is_refused_and_not_logged_and_others_are_described(ros, capfd):
     with running(ros.context, isolated=False) as runner:
-        if name == 'client':
-            node = runner.add(lambda: GoalClient(name, np.zeros((1, 3)), ros.context))
-        else:
-            node = ros.add(NODES[name])
-        (service,) = [one for one in node.services if one.srv_type is GetTypeDescription]
-        for type_hash in MALFORMED_HASHES:
-            capfd.readouterr()
-            request = GetTypeDescription.Request(type_name='x', type_hash=type_hash)
-            response = service.callback(request, GetTypeDescription.Response())
-            assert not response.successful
-            assert response.failure_reason == (
-                'type_hash must be RIHS01_ and 64 hexadecimal digits, '
-                f'got {len(type_hash)} other characters'
-            )
-            assert len(capfd.readouterr().err) < 300
-
-
-def test_type_description_is_still_provided(ros):
-    node = ros.add(VirtualRobot)
-    (info,) = node.get_publishers_info_by_topic('/odom')
-    request = GetTypeDescription.Request(
-        type_name='nav_msgs/msg/Odometry', type_hash=str(info.topic_type_hash)
-    )
-    client = ros.peer.create_client(GetTypeDescription, '/virtual_robot/get_type_description')
-    ros.until(client.service_is_ready, 'the service')
-    future = client.call_async(request)
-    ros.until(future.done, 'the answer')
-    assert future.result().successful
-    assert future.result().type_description.type_description.type_name == 'nav_msgs/msg/Odometry'
+        node = runner.add(lambda: GoalClient('client', np.zeros((1, 3)), ros.context))
+        for one in (node, ros.add(VirtualRobot)):
+            (info,) = ros.peer.get_publishers_info_by_topic('/odom') or [None]
+            (service,) = [found for found in one.services if found.srv_type is GetTypeDescription]
+            for type_hash in MALFORMED_HASHES:
+                capfd.readouterr()
+                request = GetTypeDescription.Request(type_name='x', type_hash=type_hash)
+                response = service.callback(request, GetTypeDescription.Response())
+                assert not response.successful
+                assert f'got {len(type_hash)} other characters' in response.failure_reason
+                assert len(capfd.readouterr().err) < 300
+        request.type_name, request.type_hash = 'nav_msgs/msg/Odometry', str(info.topic_type_hash)
+        assert service.callback(request, GetTypeDescription.Response()).successful
 
 
 # --- /clock
 
 
-@pytest.mark.parametrize(
-    ('name', 'sec', 'nanosec'),
-    [('virtual_robot', -1, 0), ('go_to_goal', -1, 1_000_000_000), ('wheel_bridge', -(2**31), 0)],
-)
-def test_node_survives_an_invalid_clock(ros, capfd, name, sec, nanosec):
+@pytest.mark.parametrize(('name', 'nanosec'), [('virtual_robot', 0), ('go_to_goal', 10**9)])
+def test_node_survives_an_invalid_clock(ros, capfd, name, nanosec):
     node = ros.add(NODES[name], parameters={'use_sim_time': True})
     time = ros.talk(Clock, '/clock')
     time.publish(clock(5))
     ros.until(lambda: node.now() == 5_000_000_000, 'the time is known')
-    time.publish(clock(sec, nanosec))
-    ros.until_said(capfd, '/clock dropped: ', f'got sec {sec}, nanosec {nanosec}')
+    time.publish(clock(-1, nanosec))
+    ros.until_said(capfd, '/clock dropped: ', f'got sec -1, nanosec {nanosec}')
     assert node.now() == 5_000_000_000
     time.publish(clock(6))
     ros.until(lambda: node.now() == 6_000_000_000, 'time goes on')
@@ -206,20 +155,7 @@ def plain(context):
     return Node('plain', context=context)
 
 
-def test_goal_client_drops_odometry_with_a_negative_stamp(capfd):
-    with ros_context(['test']) as context, running(context, isolated=True) as runner:
-        node = runner.add(lambda: client(context))
-        message = odometry(1.0, 2.0, 0.5)
-        message.header.stamp.sec = -1
-        receive(node, '/odom', message)
-        assert node.robot is None
-        assert 'odometry dropped: its stamp must have sec of at least 0' in capfd.readouterr().err
-        message.header.stamp.sec = 7
-        receive(node, '/odom', message)
-        assert node.robot.stamp == 7_000_000_000
-
-
-@pytest.mark.parametrize(('make', 'isolated'), [(client, True), (client, False), (plain, False)])
+@pytest.mark.parametrize(('make', 'isolated'), [(client, True), (plain, False)])
 def test_runner_guards_the_nodes_of_the_tools(capfd, make, isolated):
     arguments = ['test', '--ros-args', '-p', 'use_sim_time:=true']
     with ros_context(arguments) as context, running(context, isolated=isolated) as runner:

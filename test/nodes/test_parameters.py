@@ -1,20 +1,26 @@
-"""Parameters: declared once, compared with the files in config/, refused with the reason."""
+"""Parameters: declared once, compared with the files in config/, refused with the reason, and files that
+are for other nodes."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import FrozenInstanceError, fields
+import re
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 import yaml
 from rcl_interfaces.msg import ParameterType
+from rclpy.node import Node
 from rclpy.parameter import Parameter
+from support.lockstep_nodes import LEAN, change
 
+from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.parameters.declaration import ParameterError, specifications
+from diffdrive_jacobian.parameters.file import concerns, robot_parameters, sections
 from diffdrive_jacobian.parameters.nodes import (
     GoToGoalParameters,
     VirtualRobotParameters,
@@ -22,6 +28,7 @@ from diffdrive_jacobian.parameters.nodes import (
 )
 from diffdrive_jacobian.ros.parameters import report_unknown
 from diffdrive_jacobian.ros.runner import ros_context
+from diffdrive_jacobian.tools._cli import warn_of_unused_files
 
 NODES = {
     'virtual_robot': (VirtualRobot, VirtualRobotParameters),
@@ -81,31 +88,72 @@ def test_every_parameter_is_described_as_declared(add, name):
             assert '[' in specification.description, f'{ros_name} has no unit'
 
 
-BAD = [
-    ({'wheel_radius': 0.0}, "'wheel_radius' must be in [0.001, 10], got 0.0"),
-    ({'wheel_radius': math.nan}, 'got nan'),
-    ({'wheel_radius': '1'}, "'wheel_radius' must be a double (as 1.0), got '1'"),
-    ({'publish_rate': 5000.0}, "'publish_rate' must be in [0.1, 1000], got 5000.0"),
-    ({'enable_odom_tf': 1}, "'enable_odom_tf' must be a bool (true or false), got 1"),
-    ({'linear_x_max_velocity': -0.1}, "'linear.x.max_velocity' must be in [0, 1000] or .nan"),
-    ({'command_interface': 'legs'}, "must be one of 'twist', 'wheels', got 'legs'"),
-    ({'left_wheel_name': 'right_wheel_joint'}, "must differ, both are 'right_wheel_joint'"),
-]
+# --- What is refused
+
+CHOICES = "'controller' must be one of 'go_to_goal', 'offset_point', 'pose', got "
+GAINS = 'kp', 'kv', 'xy_goal_tolerance'
+BAD = {
+    'virtual_robot': [
+        ({'wheel_radius': 0.0}, "'wheel_radius' must be in [0.001, 10], got 0.0"),
+        ({'wheel_radius': math.nan}, 'got nan'),
+        ({'wheel_radius': '1'}, "'wheel_radius' must be a double (as 1.0), got '1'"),
+        ({'publish_rate': 5000.0}, "'publish_rate' must be in [0.1, 1000], got 5000.0"),
+        ({'enable_odom_tf': 1}, "'enable_odom_tf' must be a bool (true or false), got 1"),
+        ({'linear_x_max_velocity': -0.1}, "'linear.x.max_velocity' must be in [0, 1000] or .nan"),
+        ({'linear_x_min_velocity': 0.5}, 'got 0.5'),
+        ({'command_interface': 'legs'}, "must be one of 'twist', 'wheels', got 'legs'"),
+        ({'base_frame_id': ''}, "'base_frame_id' must be not empty"),
+        ({'base_frame_id': 'odom'}, 'must differ'),
+        ({'left_wheel_name': 'right_wheel_joint'}, "must differ, both are 'right_wheel_joint'"),
+        ({'wheel_separation': 1.0, 'cmd_vel_timeout': -1.0}, 'cmd_vel_timeout'),
+    ],
+    'go_to_goal': [
+        *(({'controller': bad}, f'{CHOICES}{bad!r}') for bad in ('', 'Pose')),
+        *(({'controller': bad}, "'controller'") for bad in (2.0, ['pose'])),
+        *(({'controller': 'offset_point', 'offset': bad}, 'rank 1') for bad in (0.0, -0.0009)),
+        *(({'offset': bad}, "'offset' must be in") for bad in (math.nan, 101.0)),
+        *(({name: bad}, f"'{name}'") for name in GAINS for bad in (0.0, math.nan, 101.0)),
+    ],
+}
 
 
-def test_bad_values_cannot_exist():
-    for values, words in BAD:
+@pytest.mark.parametrize('name', BAD)
+def test_bad_values_cannot_exist_and_bad_changes_are_refused(add, name):
+    node_class, parameters = NODES[name]
+    node = add(node_class)
+    before = node.parameters
+    for values, words in BAD[name]:
         with pytest.raises(ParameterError) as caught:
-            VirtualRobotParameters(**values)
+            parameters(**values)
         assert words in str(caught.value)
-    for name in ('kp', 'kv'):
-        with pytest.raises(ParameterError, match=rf"'{name}' must be in \(0, 100\], got 0.0"):
-            GoToGoalParameters(**{name: 0.0})
-    parameters = GoToGoalParameters(kp=4.0)
-    with pytest.raises(FrozenInstanceError):
-        parameters.kp = 5.0
-    with pytest.raises(TypeError):
-        GoToGoalParameters(4.0)
+        result = change(node, **{key.replace('_x_', '__x__'): one for key, one in values.items()})
+        assert not result.successful, values
+        # What rclpy refuses, types and ranges, it describes itself.
+        by_rclpy = result.reason.startswith(('Wrong parameter type', 'Parameter '))
+        assert by_rclpy or 'read-only' in result.reason or words in result.reason
+        assert node.parameters == before
+
+
+def test_one_of_several_changes_that_is_bad_refuses_all_when_atomic(add):
+    node = add(GoToGoal)
+    changes = [Parameter('kp', value=4.0), Parameter('kv', value=-1.0)]
+    assert not node.set_parameters_atomically(changes).successful
+    assert (node.parameters.kp, node.parameters.kv) == (3.0, 0.5)
+    good, bad = node.set_parameters(changes)
+    assert good.successful
+    assert not bad.successful
+    assert (node.parameters.kp, node.parameters.kv) == (4.0, 0.5)
+    # Those of others are left alone.
+    node.declare_parameter('foreign', 3)
+    assert node.set_parameters([Parameter('foreign', value=4)])[0].successful
+
+
+def test_a_refused_start_leaves_no_node(lockstep, add):
+    with pytest.raises(ParameterError, match='wheel_radius'):
+        add(VirtualRobot, wheel_radius=-1.0)
+    assert lockstep.node.get_node_names() == ['lockstep']
+    add(VirtualRobot)
+    assert lockstep.node.get_node_names() == ['lockstep', 'virtual_robot']
 
 
 def test_limits_follow_diff_drive_controller():
@@ -125,23 +173,120 @@ def test_limits_follow_diff_drive_controller():
     assert given.v.unlimited
 
 
-def test_a_refused_start_leaves_no_node(lockstep, add):
-    with pytest.raises(ParameterError, match='wheel_radius'):
-        add(VirtualRobot, wheel_radius=-1.0)
-    assert lockstep.node.get_node_names() == ['lockstep']
-    add(VirtualRobot)
-    assert lockstep.node.get_node_names() == ['lockstep', 'virtual_robot']
+def test_quality_of_service_can_be_overridden(add):
+    node = add(VirtualRobot, **{'qos_overrides./odom.publisher.reliability': 'best_effort'})
+    (info,) = node.get_publishers_info_by_topic('/odom')
+    assert info.qos_profile.reliability.name == 'BEST_EFFORT'
+    (info,) = node.get_publishers_info_by_topic('/joint_states')
+    assert info.qos_profile.reliability.name == 'RELIABLE'
+    for override, value in (('depth', 2**31), ('depth', -1), ('history', 'keep_none')):
+        with pytest.raises(ParameterError, match='the qos_overrides of /odom are invalid: ') as caught:
+            add(VirtualRobot, **{f'qos_overrides./odom.publisher.{override}': value})
+        assert str(caught.value).endswith(f'(got publisher.{override}: {value})')
 
 
-def test_one_of_several_changes_that_is_bad_refuses_all_when_atomic(add):
-    node = add(GoToGoal)
-    changes = [Parameter('kp', value=4.0), Parameter('kv', value=-1.0)]
-    assert not node.set_parameters_atomically(changes).successful
-    assert (node.parameters.kp, node.parameters.kv) == (3.0, 0.5)
-    good, bad = node.set_parameters(changes)
-    assert good.successful
-    assert not bad.successful
-    assert (node.parameters.kp, node.parameters.kv) == (4.0, 0.5)
+# --- Files
+
+
+@pytest.fixture
+def written(tmp_path):
+    """A function that writes a file of parameters and returns its path."""
+
+    def write(text):
+        path = tmp_path / 'p.yaml'
+        path.write_text(text)
+        return str(path)
+
+    return write
+
+
+def test_the_last_value_counts(written):
+    path = written('/**/go_to_goal: {ros__parameters: {kp: 5.0, kv: 2, xy_goal_tolerance: 0.1}}')
+    arguments = ['--params-file', path, '-p', 'kp:=6', '-p', 'go_to_goal:kv:=1.5']
+    with ros_context(['test', '--ros-args', *arguments]) as context:
+        node = GoToGoal(context=context)
+        assert (node.parameters.kp, node.parameters.kv) == (6.0, 1.5)
+        # Integers are taken for doubles.
+        node.set_parameters([Parameter('kp', value=7)])
+        assert node.parameters.kp == node.get_parameter('kp').value == 7.0
+        assert node.parameters.xy_goal_tolerance == 0.1
+        node.destroy_node()
+
+
+KEYS = (
+    *('virtual_robot', '/virtual_robot', '/**', '**', '/*', '*', '/**/virtual_robot'),
+    *('/*/virtual_robot', 'a/virtual_robot', '/a/virtual_robot', '/a/*', '/a/**'),
+    *('/a/b/virtual_robot', '/a/**/virtual_robot', '/other', '/virtual_robot2', '/b/virtual_robot'),
+)
+
+
+def test_a_name_concerns_the_nodes_to_which_rclpy_gives_the_parameters(written):
+    for key in KEYS:
+        file = written(f'"{key}":\n  ros__parameters:\n    given: 1.0\n')
+        ((name, _),) = sections(file)
+        with ros_context(['test', '--ros-args', '--params-file', file]) as context:
+            for namespace in ('', '/a', '/a/b'):
+                node = Node('virtual_robot', namespace=namespace, context=context, **LEAN)
+                given = 'given' in node._parameter_overrides
+                assert concerns(name, node.get_fully_qualified_name()) == given, (key, namespace)
+                node.destroy_node()
+
+
+def test_the_names_in_a_file_are_found(written):
+    for text, names in (
+        ('a:\n  b:\n    ros__parameters: {x: {y: 1}, z: [1, {q: 2}]}\n', ['/a/b']),
+        ('{a: {ros__parameters: {x: 1}}, /b: {ros__parameters: {}}}', ['/a']),
+        ('a: &p\n  ros__parameters: {x: 1}\nb: *p\n', ['/a', '/b']),
+        ('a: [1, 2]\nb: {c: 1}\n', []),
+        ('', []),
+        ('text', []),
+    ):
+        assert [name for name, _ in sections(written(text))] == names, text
+
+
+def test_a_file_that_cannot_be_read_is_refused_and_not_called_empty(tmp_path, capsys):
+    path = tmp_path / 'p.yaml'
+    for content in (None, b'a: [1, {', b'? {a: 1}\n: 1', b'\xff\xfe\0', b'#' * 2_000_001):
+        if content is not None:
+            path.write_bytes(content)
+        for read in (sections, robot_parameters):
+            with pytest.raises(UserError, match=f'must be a file of ROS parameters, got {path}'):
+                read(str(path))
+        warn_of_unused_files('drive_to', ['--ros-args', '--params-file', str(path)], ['/virtual_robot'])
+        assert capsys.readouterr().err == ''
+
+
+def test_a_file_without_parameters_is_reported(written, capsys):
+    """All of these rcl accepts without a word."""
+    for text in ('', '{}', 'text', 'virtual_robot: {ros__parameters: {}}'):
+        file = written(text)
+        warn_of_unused_files('virtual_robot', ['--ros-args', '--params-file', file], ['/virtual_robot'])
+        words = f'virtual_robot: warning: --params-file {file} has no parameters: '
+        assert words in capsys.readouterr().err
+        with pytest.raises(UserError, match='it has none of virtual_robot'):
+            robot_parameters(file)
+
+
+def test_a_file_for_other_nodes_is_reported_with_the_names(written, capsys):
+    file = written('/robot1/virtual_robot:\n  ros__parameters:\n    x: 1.0\n')
+    ros = ['--ros-args', '--params-file', file, '--']
+    warn_of_unused_files('drive_to', ros, ['/robot1/virtual_robot', '/go_to_goal'])
+    assert capsys.readouterr().err == ''
+    warn_of_unused_files('drive_to', ros, ['/virtual_robot', '/go_to_goal'])
+    words = 'it is for /robot1/virtual_robot, the nodes are /virtual_robot, /go_to_goal\n'
+    assert capsys.readouterr().err.endswith(words)
+
+
+def test_a_tool_without_nodes_takes_the_parameters_of_the_robot_alone(written):
+    text = '/**/wheel_bridge: {ros__parameters: {wheel_radius: 0.1}}'
+    with pytest.raises(UserError, match='none of virtual_robot, but of '):
+        robot_parameters(written(text))
+    for name in ('/a/virtual_robot', '/**', '"*"'):
+        text = f'{name}: {{ros__parameters: {{linear: {{x: 1.0}}}}}}'
+        assert robot_parameters(written(text)) == {'linear.x': 1.0}
+
+
+# --- Unknown parameters
 
 
 def test_unknown_parameters_are_named_with_what_was_meant(add, capfd):
@@ -153,33 +298,18 @@ def test_unknown_parameters_are_named_with_what_was_meant(add, capfd):
     assert 'qos_overrides' not in said
 
 
-def test_quality_of_service_can_be_overridden(add):
-    node = add(VirtualRobot, **{'qos_overrides./odom.publisher.reliability': 'best_effort'})
-    (info,) = node.get_publishers_info_by_topic('/odom')
-    assert info.qos_profile.reliability.name == 'BEST_EFFORT'
-    (info,) = node.get_publishers_info_by_topic('/joint_states')
-    assert info.qos_profile.reliability.name == 'RELIABLE'
-    for override, value in (
-        *(('depth', depth) for depth in (2**63 - 1, 2**31, -(2**63), -1)),
-        ('history', 'keep_none'),
-        ('reliability', ''),
-    ):
-        with pytest.raises(ParameterError) as caught:
-            add(VirtualRobot, **{f'qos_overrides./odom.publisher.{override}': value})
-        message = str(caught.value)
-        assert message.startswith('the qos_overrides of /odom are invalid: ')
-        assert message.endswith(f'(got publisher.{override}: {value})')
-        assert '\n' not in message
+SHARED = """
+/**: {ros__parameters: {wheel_radius: 0.1, left_wheel_name: l, own: 1, another.name: 2, kpp: 1.0}}
+/**/go_to_goal: {ros__parameters: {colour: red}}
+"""
 
 
-def test_the_last_word_counts(tmp_path):
-    path = tmp_path / 'parameters.yaml'
-    path.write_text('/**/go_to_goal: {ros__parameters: {kp: 5.0, kv: 2, xy_goal_tolerance: 0.1}}')
-    arguments = ['--params-file', str(path), '-p', 'kp:=6', '-p', 'go_to_goal:kv:=1.5']
-    with ros_context(['test', '--ros-args', *arguments]) as context:
+def test_a_parameter_for_all_nodes_need_not_be_of_each(written, capfd):
+    """A misspelt one is reported, and so is one that is only for this node."""
+    arguments = ['--params-file', written(SHARED), '-p', 'shape:=1']
+    with ros_context(['go_to_goal', '--ros-args', *arguments]) as context:
         node = GoToGoal(context=context)
-        assert (node.parameters.kp, node.parameters.kv) == (6.0, 1.5)
-        node.set_parameters([Parameter('kp', value=7)])
-        assert node.parameters.kp == node.get_parameter('kp').value == 7.0
-        assert node.parameters.xy_goal_tolerance == 0.1
+        report_unknown([node])
         node.destroy_node()
+    reported = re.findall("unknown parameter '([^']*)'", capfd.readouterr().err)
+    assert reported == ['colour', 'kpp', 'shape']

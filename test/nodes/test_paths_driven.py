@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from nav_msgs.msg import Path as PathMessage
 from support.bags import status
-from support.processes import Drive, open_world
-from support.ros_messages import goal, odometry, path, receive
+from support.ros_messages import goal, odometry, path, receive, time_of
 from support.runs import STRAIGHT, run_of
 
 from diffdrive_jacobian.bags.run import read_run
@@ -25,57 +24,44 @@ from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.plots.run_figure import figure
 from diffdrive_jacobian.plots.run_table import write_csv
-from diffdrive_jacobian.recording.recording import open_recording
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.drive_to import main
 
 TAKES_TIME = {'linear.x.max_acceleration': 0.3, 'wheel_lag': 0.2, 'command_delay': 0.2}
 
 
-@pytest.mark.slow
 def test_a_robot_that_takes_time_stops_at_the_end():
-    known, planned = {**TAKES_TIME, 'stop_in_time': True}, line_path(0.5)
-    outcome = drive(planned, lockstep=True, parameters=known, robot_parameters=TAKES_TIME)
+    known = {**TAKES_TIME, 'stop_in_time': True}
+    outcome = drive(line_path(0.4), lockstep=True, parameters=known, robot_parameters=TAKES_TIME)
     assert outcome.arrived
     assert not outcome.moving
     assert outcome.distance < 0.021
-    assert drive(planned, lockstep=True, robot_parameters=TAKES_TIME).distance > 0.04
 
 
 def test_a_robot_that_still_moves_is_not_said_to_have_stopped(capsys):
-    arguments = ['0.5', '0', '--lockstep', '--no-record', '--command-delay', '1', '--wheel-lag', '5']
+    arguments = ['0.2', '0', '--lockstep', '--no-record', '--command-delay', '1', '--wheel-lag', '5']
     assert main(arguments, Signals()) == 0
     out = capsys.readouterr().out
     assert 'arrived: the robot still moved at x' in out
     assert 'the robot rolled out of the tolerance of 0.02 m' in out
 
 
-@pytest.mark.parametrize('law', ['pure_pursuit', 'kanayama', 'offset_point', 'dynamic_feedback'])
-def test_a_path_that_turns_back_is_driven_to_its_end(law):
-    there_and_back = Path(np.array([(0.0, 0.0), (0.2, 0.0), (0.4, 0.0), (0.2, 0.0), (0.0, 0.0)]))
-    how = {'path_controller': law, 'path_speed': 0.4}
-    outcome = drive(there_and_back, lockstep=True, timeout=60.0, parameters=how)
-    assert outcome.arrived
-    assert outcome.seconds > 1.8
-
-
-@pytest.mark.slow
 def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
     bag = tmp_path / 'circle'
-    arguments = ['--path', 'circle:0.25', '--speed', '0.4', '--lockstep', '-o', str(bag), '--no-plot']
+    arguments = ['--path', 'circle:0.15', '--speed', '0.4', '--lockstep', '-o', str(bag), '--no-plot']
     assert main(arguments, Signals()) == 0
     assert 'm from the end of the path, after at most 0.00' in capsys.readouterr().out
     one = timeline(read_run(bag))
     ((planned,), series) = one.paths, one.run.odometry.values
-    assert planned.length == pytest.approx(math.pi / 2.0, rel=1e-3)
-    on_path = one.progress > 0.5
-    assert on_path.sum() > 100
-    speeds = series[on_path & (one.progress < 1.3), 3]
+    assert planned.length == pytest.approx(0.3 * math.pi, rel=1e-3)
+    on_path = one.progress > 0.3
+    assert on_path.sum() > 50
+    speeds = series[on_path & (one.progress < 0.7), 3]
     assert speeds == pytest.approx(np.full(len(speeds), 0.4))
     assert abs(one.across[on_path]).max() < 0.01
-    assert abs(one.path_heading_error[on_path]).max() < 0.02
+    assert abs(one.path_heading_error[on_path]).max() < 0.03
     assert np.isnan(one.along).all()
-    assert (one.path >= 0).sum() == np.isfinite(one.across).sum() > 150
+    assert (one.path >= 0).sum() == np.isfinite(one.across).sum() > 80
     # Until the robot has arrived.
     assert one.path[-1] == -1
     assert one.progress[one.path >= 0][-1] == pytest.approx(planned.length, abs=0.021)
@@ -84,43 +70,28 @@ def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
         *_, row = (row for row in csv.DictReader(file) if row['path_progress_m'])
     assert float(row['path_progress_m']) == pytest.approx(planned.length, abs=0.021)
     assert (row['along_path_m'], row['distance_m']) == ('', '')
+    # The table is a trajectory that can be driven again.
+    again = planned_path(str(tmp_path / 'run.csv'))
+    assert again.length == pytest.approx(planned.length, abs=0.03)
+    assert again.duration == pytest.approx(np.ptp(one.run.odometry.stamps) / 1e9)
     plane, *panels = figure([one.run]).axes
     assert [panel.get_ylabel() for panel in panels[:2]] == ['across path [m]', 'heading to path [rad]']
-    assert any(np.allclose(np.ptp(line.get_data(), axis=1), 0.5, atol=1e-3) for line in plane.lines)
+    assert any(np.allclose(np.ptp(line.get_data(), axis=1), 0.3, atol=1e-3) for line in plane.lines)
 
 
 def test_the_true_distance_of_a_robot_that_drifts_is_reported(capsys):
-    arguments = ['--path', 'line:0.5', '--lockstep', '--no-record', '--ros-args', '-p']
+    arguments = ['--path', 'line:0.1', '--lockstep', '--no-record', '--ros-args', '-p']
     assert main([*arguments, 'simulate_slip:=true'], Signals()) == 0
     assert re.search(r'm from it by odometry, truly 0\.\d+ m from its end', capsys.readouterr().out)
-
-
-def test_a_run_of_a_table_can_be_driven_again(tmp_path):
-    """The CSV of a run is a trajectory, and the new run has errors along it."""
-    path = line_path(1.0).timed(0.25)
-    recording = open_recording('drive', str(tmp_path / 'bag'), 'mcap', lossless=True, replace=False)
-    kanayama = {'path_controller': 'kanayama'}
-    outcome = drive(path, lockstep=True, parameters=kanayama, recording=recording)
-    recording.finish()
-    assert outcome.arrived
-    assert outcome.seconds == pytest.approx(4.0, abs=0.3)
-    run = read_run(tmp_path / 'bag')
-    one = timeline(run)
-    late = one.progress > 0.5
-    assert abs(one.along[late]).max() < 0.02
-    write_csv(run, tmp_path / 'run.csv')
-    again = planned_path(str(tmp_path / 'run.csv'))
-    assert again.length == pytest.approx(1.0, abs=0.03)
-    assert again.duration == pytest.approx(np.ptp(run.odometry.stamps) / 1e9)
 
 
 def test_a_shape_begins_at_the_robot():
     start = [f'virtual_robot:{name}:={at}' for name, at in zip('xy', (2.0, 1.0), strict=True)]
     arguments = ['--ros-args', '-p', start[0], '-p', start[1], '-p', 'virtual_robot:theta:=1.5']
-    outcome = drive(line_path(0.5), relative=True, lockstep=True, ros_arguments=arguments)
+    outcome = drive(line_path(0.2), relative=True, lockstep=True, ros_arguments=arguments)
     assert outcome.arrived
     assert outcome.across < 1e-6
-    expected = 2.0 + 0.5 * math.cos(1.5), 1.0 + 0.5 * math.sin(1.5)
+    expected = 2.0 + 0.2 * math.cos(1.5), 1.0 + 0.2 * math.sin(1.5)
     assert outcome.pose[:2] == pytest.approx(expected, abs=0.021)
 
 
@@ -129,7 +100,7 @@ def test_send_path_follows_a_path_cancels_a_long_one_and_reports_a_refused_one()
         runner.add(lambda: VirtualRobot(context=runner.context))
         runner.add(lambda: GoToGoal(context=runner.context))
         arrived = send_goal(circle_path(0.15), runner=runner, relative=True)
-        canceled = send_goal(line_path(5.0), runner=runner, relative=True, timeout=1.0)
+        canceled = send_goal(line_path(5.0), runner=runner, relative=True, timeout=0.5)
         refused = send_goal(line_path(5.0), runner=runner, frame='map')
     assert arrived.arrived
     assert arrived.topic == '/path'
@@ -158,9 +129,9 @@ def test_a_trajectory_is_sent_with_stamps_where_the_robot_is(ros):
     (message,) = received
     last = message.poses[-1]
     assert (last.pose.position.x, last.pose.position.y) == pytest.approx((1.0, 3.0))
-    stamps = [one.header.stamp.sec * 10**9 + one.header.stamp.nanosec for one in message.poses]
+    stamps = [time_of(one) for one in message.poses]
     assert stamps[-1] - stamps[0] == 2 * 10**9
-    assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(stamps[0], 10**9)
+    assert time_of(message) == stamps[0]
     assert client.distance == pytest.approx(1.0)
 
 
@@ -175,8 +146,6 @@ def paths_of(run):
 
 
 ROUTE = path((0, 0), (5, 0))
-
-
 ACCEPTED = (11.0, '/goal_status', status(2))
 
 
@@ -194,6 +163,14 @@ def test_a_path_counts_until_it_has_ended_or_a_goal_replaces_it(tmp_path, extra)
     assert (timeline(run).goal >= 0).sum() == (100 if extra[0][1] == '/goal_pose' else 0)
 
 
+def test_errors_along_a_trajectory_are_those_at_its_times(tmp_path):
+    """The robot is at x = 0.5 m then and drives at 0.5 m/s, as the trajectory does, but ahead of it."""
+    trajectory = path((0.4, 0.0), (1.4, 0.0), times=[11.0, 13.0])
+    one = timeline(run_of(tmp_path, [(11.0, '/path', trajectory)], **STRAIGHT))
+    along = one.along[(one.time > 1.1) & (one.time < 2.5)]
+    assert along == pytest.approx(np.full(len(along), 0.1), abs=1e-6)
+
+
 def test_a_path_that_was_refused_or_is_none_never_counts(tmp_path):
     extra = [
         (10.0, '/path', ROUTE),
@@ -206,23 +183,3 @@ def test_a_path_that_was_refused_or_is_none_never_counts(tmp_path):
     (tmp_path / 'bare').mkdir()
     bare = run_of(tmp_path / 'bare', [(11.0, '/path', path((9, 9)))], **STRAIGHT)
     assert paths_of(bare) == [(0.0, -1)]
-    assert len(figure([bare]).axes) > 1
-
-
-# --- Processes
-
-
-@pytest.fixture
-def world(tmp_path):
-    with open_world(tmp_path) as opened:
-        yield opened
-
-
-@pytest.mark.process
-def test_send_path_drives_processes_along_a_trajectory(world):
-    Drive(world)
-    sender = world.run('send_path', 'line:0.3', '--speed', '0.3')
-    assert sender.exit() == 0
-    assert sender.last_line.startswith('arrived, 0.0')
-    assert sender.last_line.endswith('m from the path')
-    assert sender.stderr == ''

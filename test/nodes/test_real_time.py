@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
@@ -28,32 +29,23 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros import node as ros_node
 
-GAINS = {'kp': 12.0, 'kv': 2.0}
-"""Such that a robot that gets its last command late, on a busy machine, has rolled little farther."""
+GAINS = {'kp': 6.0, 'kv': 2.0}
+"""So small that the robot arrives although odometry and commands are late on a busy machine."""
 NEAR = 0.1
-"""How far from a goal a robot may stop (m), whose tolerance is 0.02 m: two seconds late."""
-
-
-def team(ros, namespace='', **gains):
-    """A robot driven by its wheels, its bridge and its controller."""
-    wheels = {'command_interface': 'wheels', 'publish_rate': 100.0}
-    ros.add(VirtualRobot, namespace=namespace, parameters=wheels)
-    ros.add(WheelBridge, namespace=namespace)
-    ros.add(GoToGoal, namespace=namespace, parameters=gains)
-
-
-# --- Both executors
+"""How far from a goal a robot may stop (m), whose tolerance is 0.02 m."""
 
 
 def test_robot_arrives_and_stands(ros, executor_kind):
     topics = Topics(ros)
-    team(ros, **GAINS)
-    ros.talk(PoseStamped, 'goal_pose').publish(goal(0.3, 0.4))
+    ros.add(VirtualRobot, parameters={'command_interface': 'wheels'})
+    ros.add(WheelBridge)
+    ros.add(GoToGoal, parameters=GAINS)
+    ros.talk(PoseStamped, 'goal_pose').publish(goal(0.15, 0.2))
     ros.until(lambda: topics.statuses[-1:] == [SUCCEEDED] and at_rest(topics.odom[-1]), 'arrival')
-    assert math.dist(pose_of(topics.odom[-1])[:2], (0.3, 0.4)) <= NEAR
-    # The axle's centre goes as far as the mean wheel rolls, and a little farther than straight.
+    assert math.dist(pose_of(topics.odom[-1])[:2], (0.15, 0.2)) <= NEAR
+    # The axle's centre goes as far as the mean wheel rolls.
     rolled = sum(topics.states[-1].position) / 2.0 * 0.033
-    assert 0.5 - NEAR < rolled < 0.5 + 2.0 * NEAR
+    assert 0.25 - NEAR < rolled < 0.25 + 2.0 * NEAR
 
 
 def test_robot_drives_to_its_timeout_and_reports(ros, executor_kind):
@@ -68,27 +60,22 @@ def test_robot_drives_to_its_timeout_and_reports(ros, executor_kind):
     assert list(np.diff(instants(topics.odom)) > 0) == [True] * (len(topics.odom) - 1)
 
 
-def test_controller_stops_for_want_of_odometry(ros, executor_kind):
+def test_controller_and_bridge_stop_when_nothing_is_received(ros, executor_kind):
     commands = ros.listen(Twist, 'cmd_vel')
+    wheels = ros.listen(JointState, 'bridge/joint_command')
+    status = ros.listen(GoalStatus, 'goal_status')
     ros.add(GoToGoal, parameters={'odom_timeout': 0.1})
+    ros.add(WheelBridge, namespace='bridge', parameters={'cmd_vel_timeout': 0.1})
     odom = ros.talk(Odometry, 'odom')
     ros.talk(PoseStamped, 'goal_pose').publish(goal(1.0, 0.0))
-    ros.peer.create_timer(0.02, lambda: len(commands) < 3 and odom.publish(odometry(0, 0, 0)))
-    ros.until(lambda: len(commands) == 4, 'the zero')
-    assert twists(commands) == [(0.5, 0.0)] * 3 + [(0.0, 0.0)]
-
-
-def test_bridge_stops_the_wheels_once_commands_cease(ros, executor_kind):
-    out = ros.listen(JointState, 'joint_command')
-    ros.add(WheelBridge, parameters={'cmd_vel_timeout': 0.1})
-    ros.talk(Twist, 'cmd_vel').publish(twist(0.033, 0.0))
-    ros.until(lambda: len(out) == 2, 'the stop')
-    assert [list(one.velocity) for one in out] == [[1.0, 1.0], [0.0, 0.0]]
-    first, last = instants(out)
+    ros.talk(Twist, 'bridge/cmd_vel').publish(twist(0.033, 0.0))
+    ros.until(lambda: status, 'the goal is accepted')
+    odom.publish(odometry(0, 0, 0))
+    ros.until(lambda: len(commands) == len(wheels) == 2, 'the zeros')
+    assert twists(commands) == [(0.5, 0.0), (0.0, 0.0)]
+    assert [list(one.velocity) for one in wheels] == [[1.0, 1.0], [0.0, 0.0]]
+    first, last = instants(wheels)
     assert last - first >= SECOND // 10
-
-
-# --- One executor
 
 
 # --- A world without /clock

@@ -17,15 +17,10 @@ from support.lockstep_nodes import (
     add_team,
     arrives,
     change,
-    comes_after,
 )
 from support.ros_messages import at_rest, goal, instants, placement, pose_of, twists
 
 from diffdrive_jacobian.testing import Lockstep
-
-
-def distances(topics, target):
-    return [math.dist(pose_of(one)[:2], target) for one in topics.odom]
 
 
 def test_golden_case_of_document_a_through_the_topics(lockstep):
@@ -42,54 +37,43 @@ def test_golden_case_of_document_a_through_the_topics(lockstep):
     assert (round(right, 3), round(left, 3)) == (20.864, 9.440)
 
 
-@pytest.mark.parametrize(
-    ('start', 'target'),
-    [
-        ((0.0, 0.0, 0.0), (1.0, 1.0)),
-        ((0.0, 0.0, math.pi), (0.3, -1.2)),
-        ((-1.0, 0.5, -2.0), (-1.0, -1.0)),
-    ],
-    ids=str,
-)
-def test_robot_arrives_and_stands(lockstep, start, target):
-    topics = Topics(lockstep)
+def test_robot_arrives_and_stands(lockstep):
+    topics, start, target = Topics(lockstep), (-1.0, 0.5, -2.0), (-1.0, -1.0)
     add_team(lockstep, pose=start, **QUICK)
     topics.odom.clear()
     lockstep.publish('goal_pose', goal(*target))
     arrives(lockstep, topics)
     assert topics.statuses == [ACCEPTED, EXECUTING, SUCCEEDED]
     # Each odometry on the way is answered by one command; only the last of them is zero.
-    along = distances(topics, target)
+    along = [math.dist(pose_of(one)[:2], target) for one in topics.odom]
     there = next(i for i, distance in enumerate(along) if distance <= 0.02)
     assert len(topics.commands) == there + 1
     assert [i for i, command in enumerate(topics.commands) if command == Twist()] == [there]
     # And there it stands.
     assert all(one.pose == topics.odom[there].pose for one in topics.odom[there:])
     assert all(map(at_rest, topics.odom[there + 1 :]))
-    assert len(topics.odom) > there + 5
+    assert len(topics.odom) > there + 3
     # The axle's centre goes as far as the mean wheel rolls forth and back: hardly less than straight.
     velocities = [sum(one.velocity) / 2.0 * 0.033 / 50.0 for one in topics.states]
     assert sum(map(abs, velocities)) >= math.dist(start[:2], target) - 0.02
 
 
-@pytest.mark.parametrize('moment', [0.005, 0.2])
-def test_new_goal_takes_over_without_a_stop_and_cancel_stops_at_once(lockstep, team, moment):
+def test_new_goal_takes_over_without_a_stop_and_cancel_stops_at_once(lockstep, team):
     lockstep.publish('goal_pose', goal(2.0, 0.0))
-    lockstep.run_for(moment)
+    lockstep.run_for(0.2)
     lockstep.publish('goal_pose', goal(0.0, 0.5))
     arrives(lockstep, team)
-    begun = [ACCEPTED] if moment < 0.01 else [ACCEPTED, EXECUTING]
-    assert team.statuses == [*begun, CANCELED, ACCEPTED, EXECUTING, SUCCEEDED]
+    assert team.statuses == [ACCEPTED, EXECUTING, CANCELED, ACCEPTED, EXECUTING, SUCCEEDED]
     assert pose_of(team.odom[-1])[:2] == pytest.approx((0.0, 0.5), abs=0.02)
     assert team.commands.count(Twist()) == 1
     lockstep.publish('goal_pose', goal(2.0, 1.0))
-    lockstep.run_for(moment)
+    lockstep.run_for(0.2)
     assert lockstep.call(Trigger, 'cancel_goal').success
     assert instants(team.applied)[-1] == lockstep.now
     lockstep.run_for(0.02)
     here = team.odom[-1].pose
     assert at_rest(team.odom[-1])
-    lockstep.run_for(1.0)
+    lockstep.run_for(0.5)
     assert team.odom[-1].pose == here
     assert team.statuses[-1] == CANCELED
 
@@ -98,26 +82,25 @@ def test_new_goal_takes_over_without_a_stop_and_cancel_stops_at_once(lockstep, t
 
 
 def driven(names, targets):
-    """Drive teams in a world of their own; give all that they say."""
+    """Drive teams in a world of their own; return all that they publish."""
     with Lockstep() as world:
         topics = [Topics(world, name) for name in names]
         for name in names:
             add_team(world, name, **QUICK)
         for name, target in zip(names, targets, strict=True):
             world.publish(f'{name}/goal_pose', goal(*target))
-        world.run_for(1.0)
+        world.run_for(0.6)
         return [(one.odom, one.states, one.applied, one.commands, one.statuses) for one in topics]
 
 
 def test_robots_in_company_drive_as_each_drives_alone_to_the_last_bit():
-    names = ['robot_0', 'robot_1', 'robot_2']
-    targets = [(math.cos(index), math.sin(index) - 0.5) for index in range(3)]
+    names, targets = ['robot_0', 'robot_1'], [(0.3, 0.1), (-0.2, 0.3)]
     together = driven(names, targets)
-    assert [one[-1][-1] for one in together] == [SUCCEEDED] * 3
-    assert len({str(one[0][-1].pose) for one in together}) == 3
-    assert len(together[0][0]) == 51
-    for name, target, said in zip(names, targets, together, strict=True):
-        assert driven([name], [target]) == [said]
+    assert [one[-1][-1] for one in together] == [SUCCEEDED] * 2
+    assert len(together[0][0]) == 31
+    assert together[0][0][-1].pose != together[1][0][-1].pose
+    for name, target, published in zip(names, targets, together, strict=True):
+        assert driven([name], [target]) == [published]
 
 
 # --- When something comes in between
@@ -137,45 +120,20 @@ def test_a_robot_that_is_placed_or_reset_is_driven_on(lockstep, team):
     assert pose_of(team.odom[-1])[:2] == pytest.approx((1.0, 1.0), abs=0.02)
 
 
-@pytest.fixture
-def under_way(lockstep, team):
-    """A team on the way to a goal for 0.3 s."""
+@pytest.mark.parametrize('removed', ['controller', 'bridge', 'robot'])
+def test_when_a_node_is_removed_the_others_stop_within_the_timeout(lockstep, team, removed):
     assert change(team.controller, kp=3.0, kv=0.5).successful
     lockstep.publish('goal_pose', goal(5.0, 0.0))
     lockstep.run_for(0.3)
-    return team
-
-
-def test_removed_robot_stops_the_controller_within_the_timeout(lockstep, under_way):
-    seen = instants(under_way.odom)[-1]
-    lockstep.remove(under_way.robot)
-    lockstep.run_for(0.2)
-    assert Twist() not in under_way.commands
-    command = comes_after(lockstep, under_way.commands, 0.5 - (lockstep.now - seen) / 1e9)
-    assert command == Twist()
-
-
-@pytest.mark.parametrize('removed', ['controller', 'bridge'])
-def test_removed_driver_lets_the_robot_stop(lockstep, under_way, removed):
-    lockstep.remove(getattr(under_way, removed))
-    last = instants(under_way.applied)[-1]
-    lockstep.run_for(1.0)
-    # The robot sees to that, and the bridge that is left, in one instant.
-    driven = zip(instants(under_way.applied), twists(under_way.applied), strict=True)
+    lockstep.remove(getattr(team, removed))
+    last = instants(team.applied)[-1]
+    lockstep.run_for(0.7)
+    if removed == 'robot':
+        assert team.commands[-1] == Twist()
+        return
+    # The robot sees to that, and the bridge that is left, at the same time.
+    driven = zip(instants(team.applied), twists(team.applied), strict=True)
     assert {at for at, command in driven if command == (0.0, 0.0)} == {last + 500_000_000}
-    assert at_rest(under_way.odom[-1])
-    # The controller without its bridge is seen and sees: it goes on to command.
-    assert removed == 'controller' or under_way.commands[-1] != Twist()
-
-
-@pytest.mark.lockstep(start=100.0)
-@pytest.mark.parametrize('seconds', [-90.0, -0.1, 0.05, 1e6])
-def test_time_jumps_while_driving_and_the_robot_arrives(lockstep, team, seconds):
-    lockstep.publish('goal_pose', goal(1.0, 1.0))
-    lockstep.run_for(0.3)
-    lockstep.jump(seconds)
-    lockstep.run_for(0.05)
-    assert len(team.starts) == (2 if seconds < 0.0 else 1)
-    arrives(lockstep, team)
-    assert team.statuses == [ACCEPTED, EXECUTING, SUCCEEDED]
-    assert pose_of(team.odom[-1])[:2] == pytest.approx((1.0, 1.0), abs=0.02)
+    assert at_rest(team.odom[-1])
+    # The controller without its bridge goes on to command.
+    assert removed == 'controller' or team.commands[-1] != Twist()

@@ -21,8 +21,6 @@ from diffdrive_jacobian.simulation.actuators import Actuators
 R, L = 0.033, 0.16
 TWISTS = [(0.5, 3.0 * math.pi / 4.0), (0.2, 0.0), (0.0, -2.0), (-0.3, 1.0), (1000.0, -1000.0)]
 GO, STOP = [0.2 / R] * 2, [0.0, 0.0]
-late = pytest.mark.lockstep(start=100.0)
-"""Late enough that time may go back."""
 
 
 @pytest.fixture
@@ -62,135 +60,44 @@ def test_every_parameter_counts_from_the_next_command_on(lockstep, add, out):
     node = add(WheelBridge)
 
     def wheels(**parameters):
-        assert not parameters or change(node, **parameters).successful
+        assert change(node, **parameters).successful
         lockstep.publish('cmd_vel', twist(1.0, 1.0))
         return list(out[-1].velocity)
 
-    assert wheels() == pytest.approx([0.92 / R, 1.08 / R])
-    assert wheels(wheel_radius=0.1) == pytest.approx([9.2, 10.8])
-    assert wheels(wheel_separation=1.0) == pytest.approx([5.0, 15.0])
-    assert wheels(wheel_separation_multiplier=2.0) == pytest.approx([0.0, 20.0], abs=1e-14)
-    assert wheels(right_wheel_radius_multiplier=4.0) == pytest.approx([0.0, 5.0], abs=1e-14)
-    assert wheels(wheel_separation_multiplier=1.0, left_wheel_radius_multiplier=0.5) == [10.0, 3.75]
-    slowed = pytest.approx([4.0, 1.5], rel=1e-15)
-    assert wheels(max_wheel_velocity=4.0) == slowed
-    assert wheels(left_wheel_name='l', right_wheel_name='r') == slowed
+    assert wheels(wheel_radius=0.1, wheel_separation=1.0) == pytest.approx([5.0, 15.0])
+    assert wheels(right_wheel_radius_multiplier=4.0) == pytest.approx([5.0, 3.75])
+    assert wheels(left_wheel_radius_multiplier=0.5) == [10.0, 3.75]
+    assert wheels(wheel_separation_multiplier=2.0) == pytest.approx([0.0, 5.0], abs=1e-14)
+    names = {'left_wheel_name': 'l', 'right_wheel_name': 'r'}
+    slowed = wheels(wheel_separation_multiplier=1.0, max_wheel_velocity=4.0, **names)
+    assert slowed == pytest.approx([4.0, 1.5])
     assert out[-1].name == ['l', 'r']
     assert wheels(max_wheel_velocity=math.nan) == [10.0, 3.75]
-    assert len(out) == 9
+    assert len(out) == 6
 
 
-@pytest.mark.parametrize(
-    ('v', 'offset', 'words'),
-    [
-        (math.nan, 0, 'twist must be finite'),
-        (1e4, 0, 'twist must be within 1000 m/s'),
-        (0.1, SECOND, 'its stamp is 1.000000 s in the future'),
-        (0.1, -SECOND // 2 - 1, 's old, more than the timeout of 0.5 s'),
-        (0.1, -SECOND // 5, 's older than the last command, stop'),
-    ],
-)
-def test_invalid_and_old_commands_are_dropped_and_named(lockstep, add, out, capfd, v, offset, words):
+def test_invalid_and_old_commands_are_dropped(lockstep, add, out, capfd):
     add(WheelBridge, enable_stamped_cmd_vel=True)
     lockstep.run_for(9.0)
     now = lockstep.now
     lockstep.publish('cmd_vel', twist_stamped(0.3, 0.0, now - 5))
-    lockstep.publish('cmd_vel', twist_stamped(v, 0.0, now + offset))
+    for v, offset in ((math.nan, 0), (0.1, 1), (0.1, -SECOND // 2 - 1), (0.1, -6)):
+        lockstep.publish('cmd_vel', twist_stamped(v, 0.0, now + offset))
     lockstep.publish('cmd_vel', twist_stamped(0.4, 0.0, now - 5))
     lockstep.publish('cmd_vel', twist_stamped(0.5, 0.0, 0))
     assert [one.velocity[0] for one in out] == [0.3 / R, 0.4 / R, 0.5 / R]
     assert instants(out) == [now - 5, now - 5, now]
-    error = capfd.readouterr().err
-    assert error.count('command dropped: ') == 1
-    assert words in error
+    assert 'command dropped: twist must be finite' in capfd.readouterr().err
 
 
-# --- Silence
-
-
-@pytest.mark.parametrize('timeout', [1e-9, 0.5, 3600.0])
-def test_silence_stops_the_wheels_once_exactly_then(lockstep, add, out, capfd, timeout):
-    add(WheelBridge, cmd_vel_timeout=timeout)
-    lockstep.run_for(1.234)
-    lockstep.publish('cmd_vel', twist(0.2, 0.0))
-    if timeout > 1e-6:
-        for fraction in (0.5, 0.9, 0.3):
-            lockstep.run_for(fraction * timeout)
-            lockstep.publish('cmd_vel', twist(0.1, 0.0))
-        lockstep.run_for(0.6 * timeout)
-        # What is dropped does not count.
-        lockstep.publish('cmd_vel', twist(math.nan, 0.0))
-        comes_after(lockstep, out, 0.4 * timeout)
-    else:
-        lockstep.run_for(timeout)
-    assert speeds(out)[-1] == STOP
-    assert instants(out)[-1] == lockstep.now
-    count = len(out)
-    lockstep.run_for(3.0 * timeout)
-    assert len(out) == count
-    assert f'no command on /cmd_vel for {timeout:g} s' in capfd.readouterr().err
-    lockstep.publish('cmd_vel', twist(0.2, 0.0))
-    assert speeds(out)[-1] == GO
-
-
-def test_standing_wheels_are_not_stopped_nor_turning_ones_without_a_timeout(lockstep, add, out):
-    node = add(WheelBridge)
-    lockstep.publish('cmd_vel', twist(0.2, 0.0))
-    lockstep.publish('cmd_vel', twist(0.0, 0.0))
-    lockstep.run_for(10.0)
-    assert len(out) == 2
-    lockstep.publish('cmd_vel', twist(0.2, 0.0))
-    assert change(node, cmd_vel_timeout=0.0).successful
-    lockstep.run_for(1e5)
-    assert len(out) == 3
-
-
-def test_a_new_timeout_counts_from_the_last_command_on(lockstep, add, out):
-    """Requests of another process must not replace commands."""
-    node = add(WheelBridge)
-    lockstep.publish('cmd_vel', twist(0.2, 0.0))
-    for timeout in (2.0, 0.7):
-        lockstep.run_for(0.3)
-        assert change(node, cmd_vel_timeout=timeout).successful
-    assert list(comes_after(lockstep, out, 0.1).velocity) == STOP
-    # One that is over when it is set stops the wheels.
+def test_silence_is_reported_and_what_is_dropped_does_not_end_it(lockstep, add, out, capfd):
+    add(WheelBridge)
     lockstep.publish('cmd_vel', twist(0.2, 0.0))
     lockstep.run_for(0.3)
-    assert change(node, cmd_vel_timeout=0.1).successful
-    lockstep.run_for(0.01)
-    assert speeds(out) == [GO, STOP, GO, STOP]
-
-
-@late
-@pytest.mark.parametrize('seconds', [-40.0, -1e-9, 0.3, 100.0])
-def test_jumps_of_time_neither_deafen_it_nor_keep_the_wheels_turning(lockstep, add, out, seconds):
-    add(WheelBridge, enable_stamped_cmd_vel=True)
-    lockstep.publish('cmd_vel', twist_stamped(0.2, 0.0, lockstep.now))
-    lockstep.jump(seconds)
-    stopped = len(out) == 2
-    assert stopped == (seconds >= 0.5)
-    lockstep.publish('cmd_vel', twist_stamped(0.6, 0.0, lockstep.now))
-    assert out[-1].velocity[0] == 0.6 / R
-    comes_after(lockstep, out, 0.5)
-    lockstep.jump(seconds)
-    lockstep.run_for(1.0)
-    assert speeds(out)[-1] == STOP
-    assert len(out) == 3 + stopped
-
-
-@late
-@pytest.mark.parametrize('jumps', [[-50.0], [-0.5], [0.3], [-0.1, -0.1, -0.1]])
-def test_jumps_put_the_stop_off_by_a_timeout_at_most(lockstep, add, out, jumps):
-    add(WheelBridge)
-    lockstep.run_for(60.0)
-    lockstep.publish('cmd_vel', twist(0.2, 0.0))
-    left = 0.5
-    for seconds in jumps:
-        lockstep.run_for(0.1)
-        lockstep.jump(seconds)
-        # After a jump back the rest of the timeout remains.
-        left -= 0.1 + max(seconds, 0.0)
-    assert list(comes_after(lockstep, out, left).velocity) == STOP
+    lockstep.publish('cmd_vel', twist(math.nan, 0.0))
+    comes_after(lockstep, out, 0.2)
+    assert speeds(out) == [GO, STOP]
+    assert 'no command on /cmd_vel for 0.5 s' in capfd.readouterr().err
 
 
 # --- Acceleration
@@ -209,7 +116,7 @@ def test_wheels_accelerate_as_those_of_the_robot_and_stop_by_deceleration(lockst
     actuators = Actuators(acceleration=bridge.parameters.acceleration_limits())
     robot = Robot(model=replace(model, actuators=actuators), stamp=lockstep.now, pose=(0.0, 0.0, 0.0))
     robots = [robot]
-    for v, omega, seconds in ((0.4, 1.0, 0.33), (0.4, -0.5, 0.4), (-0.2, 0.0, 0.111), (0.3, 0.0, 3.0)):
+    for v, omega, seconds in ((0.4, 1.0, 0.33), (0.4, -0.5, 0.4), (-0.2, 0.0, 0.111), (0.3, 0.0, 2.0)):
         robots.append(robots[-1].commanded((v, omega), lockstep.now))
         lockstep.publish('cmd_vel', twist(v, omega))
         lockstep.run_for(seconds)
@@ -232,7 +139,7 @@ def test_wheels_go_on_to_accelerate_where_time_goes_back_and_stop_at_the_end(loc
     bridge = add(WheelBridge, **LIMITS, cmd_vel_timeout=0.0)
     lockstep.inject(TimeJump(-5.0, start=0.1))
     lockstep.publish('cmd_vel', twist(0.4, 0.0))
-    lockstep.run_for(2.0)
+    lockstep.run_for(1.2)
     v = [one.velocity[0] * R for one in out]
     assert v == sorted(v)
     assert max(np.diff(v)) == pytest.approx(0.5 * 0.02)
@@ -246,7 +153,7 @@ def test_wheels_go_on_to_accelerate_where_time_goes_back_and_stop_at_the_end(loc
     assert len(out) == count + 1
 
 
-def test_stop_leaves_the_wheels_standing_and_says_so_once(lockstep, add, out, capfd):
+def test_stop_leaves_the_wheels_standing_and_reports_it_once(lockstep, add, out, capfd):
     node = add(WheelBridge)
     node.stop('too early')
     lockstep.publish('cmd_vel', twist(0.2, 0.0))
