@@ -18,18 +18,12 @@ from diffdrive_jacobian.control import (
     go_to_pose,
     offset_point,
 )
-from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.kinematics import diff_drive, se2
 from diffdrive_jacobian.simulation import closed_loops
 
 KP, KV = 3.0, 0.5  # document A's gains
 COUNT = 2_000
 LAWS = {'go_to_goal': go_to_goal, 'offset_point': offset_point, 'pose': go_to_pose}
-HEADING_COUNTS = Arrival(use_heading=True)
-
-
-def limits_of(v, omega, wheels):
-    return VelocityLimits(min_v=-v, max_v=v, min_omega=-omega, max_omega=omega, max_wheel_speed=wheels)
 
 
 def random_poses(seed, count=COUNT, size=3.0):
@@ -80,13 +74,6 @@ def test_moved_to_another_place_or_mirrored_a_law_is_the_same(name):
     assert_allclose(twists(mirror * states, mirror * targets), [here[0], -here[1]], atol=1e-12)
 
 
-@pytest.mark.parametrize('name', BUILT_IN)
-def test_a_law_and_its_unchecked_equation_agree(name):
-    law, (states, targets) = BUILT_IN[name].law, random_poses(5, 50)
-    goals, gains = goals_of(name, targets), random_gains(6, 50)
-    np.testing.assert_array_equal(law.formula(states.T, goals.T, *gains), law(states, goals, *gains))
-
-
 # --- Document A
 
 
@@ -116,11 +103,6 @@ def test_go_to_goal_is_document_as():
     q_dot = (diff_drive.unicycle_jacobian(states[:, 2]) @ np.stack([v, omega], -1)[..., None])[..., 0]
     d_dot = -np.sum((targets - states)[:, :2] * q_dot[:, :2], axis=-1) / distance
     assert_allclose(d_dot, -gains[1] * distance * np.cos(error) ** 2, rtol=1e-9, atol=1e-12)
-
-
-def test_go_to_goal_arrives_from_every_start():
-    states, targets = random_poses(9, 500)
-    assert closed_loops(go_to_goal, states, targets[:, :2], KP, KV, duration=20.0).arrived.all()
 
 
 # --- Document B: the offset point goes straight to its goal, like exp(-k t)
@@ -157,10 +139,10 @@ def test_the_offset_point_moves_straight_towards_its_goal_whatever_the_heading()
 
 
 def test_the_offset_point_arrives_when_it_should_with_the_axle_beside_the_goal():
-    (states, targets), d = random_poses(17, 500), random_offsets(18, 500)
+    (states, targets), d = random_poses(17, 200), random_offsets(18, 200)
     d += np.copysign(0.2, d)
-    states[:100, 2], goals = np.pi, targets[:, :2]
-    goals[:50] = states[:50, :2] + [3.0, 0.0]  # exactly behind
+    states[:40, 2], goals = np.pi, targets[:, :2]
+    goals[:20] = states[:20, :2] + [3.0, 0.0]  # exactly behind
     found = closed_loops(offset_point, states, goals, 1.0, d, duration=15.0, arrival=Arrival(offset=d))
     assert found.arrived.all()
     assert np.hypot(*(point(found.pose, d) - goals).T).max() <= 0.02
@@ -206,14 +188,13 @@ def test_without_a_weight_the_heading_converges_at_critical_damping_or_twice_as_
         assert slowest == pytest.approx(expected, rel=1e-6)
 
 
-def test_on_the_position_it_stands_still_whatever_the_headings():
+def test_at_the_position_the_commands_are_zero_whatever_the_headings():
     states, targets = random_poses(23, 1000)
     targets[:, :2] = states[:, :2]
     assert not np.any(go_to_pose(states, targets, KP, KV))
     assert not np.any(go_to_goal(states, targets[:, :2], KP, KV))
-    for theta in (0.0, -0.0, math.pi, -math.pi, 2.0):
-        for x in (0.0, -0.0):
-            assert go_to_pose([x, x, theta], [0.0, -0.0, 1.0], KP, KV) == (0.0, 0.0)
+    for theta in (0.0, -0.0, math.pi, -math.pi):
+        assert go_to_pose([-0.0, 0.0, theta], [0.0, -0.0, 1.0], KP, KV) == (0.0, 0.0)
 
 
 def test_the_lyapunov_function_never_grows_along_the_polar_equations():
@@ -240,28 +221,37 @@ def test_the_lyapunov_function_never_grows_along_the_polar_equations():
     assert np.mean(smooth) > 0.98
 
 
-# --- Robots that go_to_pose drives
+# --- Robots that are driven to the end
 
 
-@pytest.mark.parametrize('case', ['free', 'limited', 'forwards', 'near'])
-def test_poses_are_taken_from_everywhere(case):
-    states, targets = random_poses(28, 200, {'near': 0.05, 'limited': 1.5}.get(case, 3.0))
-    gains, limits = (KP, KV), VelocityLimits()
-    if case == 'limited':
-        # Under limits the paths are shorter: several of them take long all the same.
-        limits = limits_of(0.22, 2.84, 6.67)
-        states, targets = states[:100], targets[:100]
-    if case == 'forwards':
-        # A robot that may not back up, whatever the gains.
-        gains, limits = (np.repeat([6.0, 12.0, 24.0, 45.0], 50), 0.5), VelocityLimits(min_v=0.0)
-    if case == 'near':
-        # With headings beside pi, exactly behind, and with other gains.
-        states[::2, 2], targets[::3, 2] = np.pi, -np.pi
-        states[::5, :2], targets[::7, :2] = [0.3, 0.0], 0.0
-        Kv, ratio = np.random.default_rng(29).uniform([[0.3], [1.0]], [[2.0], [10.0]], (2, 200))
-        gains = Kv * ratio, Kv
-    how = {'arrival': HEADING_COUNTS, 'limits': limits, 'duration': 90.0}
-    found = closed_loops(go_to_pose, states, targets, *gains, **how)
+def test_go_to_goal_arrives_from_every_start():
+    states, targets = random_poses(9, 200)
+    assert closed_loops(go_to_goal, states, targets[:, :2], KP, KV, duration=20.0).arrived.all()
+
+
+def test_poses_are_reached_from_everywhere():
+    """A batch of robots without limits, within limits, and that may not back up, with other gains."""
+    free, limited, forwards, near = (slice(begin, begin + 60) for begin in range(0, 240, 60))
+    states, targets = random_poses(28, 240, 2.0)
+    # Under limits the paths are shorter: several of them take long all the same.
+    states[limited], targets[limited] = random_poses(30, 60, 1.0)
+    states[near], targets[near] = random_poses(29, 60, 0.05)
+    # Exactly behind, and with headings of pi.
+    states[180::2, 2], targets[180::3, 2] = np.pi, -np.pi
+    states[180::5, :2], targets[180::7, :2] = [0.3, 0.0], 0.0
+    Kp, Kv = np.full((2, 240), [[KP], [KV]])
+    Kp[forwards] = np.repeat([6.0, 12.0, 24.0, 45.0], 15)
+    Kv[near], ratio = np.random.default_rng(29).uniform([[0.3], [1.0]], [[2.0], [10.0]], (2, 60))
+    Kp[near] = Kv[near] * ratio
+    v, omega, wheels = np.full((3, 240), np.inf)
+    v[limited], omega[limited], wheels[limited] = 0.22, 2.84, 6.67
+    min_v = -v
+    min_v[forwards] = 0.0
+    limits = VelocityLimits(
+        min_v=min_v, max_v=v, min_omega=-omega, max_omega=omega, max_wheel_speed=wheels
+    )
+    how = {'arrival': Arrival(use_heading=True), 'limits': limits, 'duration': 90.0}
+    found = closed_loops(go_to_pose, states, targets, Kp, Kv, **how)
     off = np.hypot(*(found.pose - targets).T[:2])
     turned = np.abs(se2.wrap_angle((found.pose - targets)[:, 2]))
     failed = np.flatnonzero(~found.arrived | (off > 0.02) | (turned > 0.02))
