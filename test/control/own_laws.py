@@ -1,4 +1,4 @@
-"""Controllers that this package does not contain: the examples of doc/controllers.md, and their packages."""
+"""Controllers of other packages: the examples of doc/controllers.md."""
 
 from __future__ import annotations
 

@@ -197,27 +197,13 @@ def test_at_the_position_the_commands_are_zero_whatever_the_headings():
         assert go_to_pose([-0.0, 0.0, theta], [0.0, -0.0, 1.0], KP, KV) == (0.0, 0.0)
 
 
-def test_the_lyapunov_function_never_grows_along_the_polar_equations():
-    (states, targets), (Kp, Kv, h) = random_poses(24), random_gains(25, names=3)
-    rho, alpha, phi = polar(states, targets)
-    v, omega = go_to_pose(states, targets, Kp, Kv, h)
-    rho_dot = -v * np.cos(alpha)
-    phi_dot = v * np.sin(alpha) / rho
-    alpha_dot = phi_dot - omega
-    terms = 2.0 * np.array([rho * rho_dot, alpha * alpha_dot, h * phi * phi_dot])
-    rounding = 1e-12 * np.abs(terms).max(axis=0)
-    V_dot = terms.sum(axis=0)
-    assert np.all(V_dot <= rounding)
-    exact = -2.0 * (Kv * (rho * np.cos(alpha)) ** 2 + Kp * alpha**2)
-    assert np.all(np.abs(V_dot - exact) <= rounding)
-
-
 # --- Robots that are driven to the end
 
 
 def test_poses_are_reached_from_everywhere():
     """A batch of robots without limits, within limits, and that may not back up, with other gains."""
-    free, limited, forwards, near = (slice(begin, begin + 40) for begin in range(0, 160, 40))
+    # The first 40 have no limits.
+    limited, forwards, near = slice(40, 80), slice(80, 120), slice(120, 160)
     states, targets = random_poses(28, 160, 1.5)
     # Under limits the paths are shorter: several of them take long all the same.
     states[limited], targets[limited] = random_poses(30, 40, 0.7)

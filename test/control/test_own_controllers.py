@@ -51,9 +51,7 @@ def test_an_installed_controller_is_chosen_at_the_start_and_live(lockstep, site)
 
 
 @pytest.mark.pages
-def test_the_example_is_installed_and_drives_and_its_bag_is_read_without_it(
-    site, tmp_path, monkeypatch
-):
+def test_the_example_is_installed_and_drives_and_its_bag_is_read_without_it(site, tmp_path, monkeypatch):
     (declared,) = re.findall(r'```toml\n(.*?)```', PAGE, re.DOTALL)
     group, entry = re.search(r'entry-points\."(.*?)"\]\n(.*)', declared.replace(' "', ' ')).groups()
     entry = entry.rstrip('"')
@@ -274,31 +272,26 @@ def test_every_field_is_described():
 # --- The objects
 
 INVALID_CONTROLLERS = [
-    ({'name': 'two words'}, "letter, then letters, digits, '_', '.' or '-', at most 64, got 'two words'"),
+    ({'name': 'two words'}, "'_', '.' or '-', at most 64, got 'two words'"),
     ({'name': 3}, 'got 3'),
     ({'law': 'law'}, 'law must be a function'),
-    ({'gains': ('kp', 'ki')}, 'gains must be a tuple of Gain'),
     ({'gains': [KP, KV]}, 'gains must be a tuple of Gain'),
     ({'gains': (KP, KP)}, 'gains must have different names, got kp, kp'),
     ({'state': (math.nan,)}, 'state must be finite'),
     ({'offset': 'd'}, "offset must be '' or one of kp, kv, got 'd'"),
     ({'takes_heading': 1}, 'takes_heading must be True or False'),
-    ({'advice': ()}, 'advice must be a function'),
     ({'slope': 1.0}, 'slope must be a function'),
     ({'boundary': (1.0, '')}, 'boundary must be of class Boundary'),
-    ({'summary': None}, 'summary must be a string'),
 ]
 INVALID_GAINS = [
-    ({'name': 'K'}, 'name of a gain must be a lower-case letter, then lower-case letters, digits or _'),
+    ({'name': 'K'}, 'name of a gain must be a lower-case letter'),
     ({'name': 'lambda'}, "got 'lambda'"),
-    ({'default': math.nan}, 'default must be finite'),
     ({'default': 5.0}, 'ki must be in [-1, 2], got 5'),
     ({'above': 1.0}, 'ki must be in (1, 2], got 1'),
     ({'bounds': (1.0,)}, 'bounds must have shape (..., 2)'),
     ({'usual': (1.0, 1.0)}, 'usual must be (first, last) with first < last'),
     ({'usual': (0.0, 3.0)}, 'ki must be in [-1, 2], got 3'),
     ({'usual': (-2.0, 0.0)}, 'ki must be in [-1, 2], got -2'),
-    ({'unit': None}, 'unit must be a string'),
 ]
 
 

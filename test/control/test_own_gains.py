@@ -130,10 +130,8 @@ def test_three_gains_are_swept_two_at_a_time_and_drawn():
     np.testing.assert_array_equal(alone.time, swept.outcomes.time[0, 1])
     drawn = figure(swept)
     assert drawn.get_suptitle().startswith('polar: ')
-    # It has no boundary, and the grid contains the defaults.
-    defaults, entry = drawn.axes[3].get_legend().get_texts()
-    assert defaults.get_text() == 'defaults: k_rho 0.5, k_alpha 2'
-    assert entry.get_text().startswith('fastest: ')
+    texts = [text.get_text() for text in drawn.axes[3].get_legend().get_texts()]
+    assert 'defaults: k_rho 0.5, k_alpha 2' in texts
 
 
 SMALL = ('--grid', '2', '--starts', '1', '--rate', '10', '--csv', 'a.csv')

@@ -109,24 +109,6 @@ def test_numbers_of_any_size_are_within_their_limits_to_the_last_bit_alone_and_i
             assert one == (limited[0][i], limited[1][i])
 
 
-def test_commands_robots_and_limits_broadcast():
-    rng = np.random.default_rng(8)
-    drawn = random_limits(rng, 4)
-    drawn['min_v'][0] = drawn['max_omega'][1] = 0.0
-    v, omega = random_commands(rng, 4)
-    r, separation = rng.uniform(0.01, 0.1, (3, 1)), rng.uniform(0.1, 0.5, (3, 1))
-    limited = saturate(v, omega, VelocityLimits(**drawn), r, separation)
-    for i, j in np.ndindex(3, 4):
-        limits = VelocityLimits(**{name: float(values[j]) for name, values in drawn.items()})
-        one = saturate(v[j], omega[j], limits, r[i, 0], separation[i, 0])
-        assert (limited[0][i, j], limited[1][i, j]) == one
-    # What is returned and stored has numbers of its own.
-    mine = np.array([1.0, 2.0])
-    stored, returned = VelocityLimits(max_v=mine), saturate(mine, mine, VelocityLimits(), R, L)
-    mine[0] = -5.0
-    assert stored.max_v[0] == returned[0][0] == returned[1][0] == 1.0
-
-
 def test_an_invalid_limit_is_named():
     for name in EVERY_LIMIT:
         allowed = 'positive' if name == 'max_wheel_speed' else 'zero or '

@@ -64,14 +64,6 @@ def test_waypoints_are_reached_in_order_and_the_heading_only_when_it_counts():
     assert {tuple(pose[:2]) for pose, _ in turning} == {tuple(end[:2])}
 
 
-@pytest.mark.parametrize('form', [tuple, list, np.array])
-def test_the_law_is_called_with_the_pose_in_any_form_and_the_waypoint(form):
-    for index in range(3):
-        here, command = Waypoints(POSES, index).follow(form([0, 3, 2]), echo, WITH_HEADING, GAIN)
-        assert (here.index, here.turning) == (index, False)
-        assert command == (0.0, 3.0, 2.0, *POSES[index])
-
-
 def test_waypoints_already_reached_are_skipped_in_one_step_without_a_copy():
     """Else a message with 300,000 poses in one place would block for minutes."""
     poses = np.zeros((300, 3))

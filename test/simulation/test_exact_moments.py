@@ -12,14 +12,8 @@ from support.moments_reference import DRIVES, noisy_runs, reference
 from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.exact_moments import (
-    SHORT_NOISE,
-    SHORT_TURN,
-    NoiseMoments,
-    central,
     gaussian,
     propagate_moments,
-    series,
-    short_arc,
 )
 
 L, K = 0.16, 1e-5
@@ -77,25 +71,6 @@ def test_the_closed_form_solves_the_differential_equation(start):
         error = np.abs(np.subtract(actual, expected))
         assert np.all(error <= 1e-12 * scales(actual)), (v, omega, duration, k, error / scales(actual))
         positive_semidefinite(actual.second_moment)
-
-
-def test_the_short_form_is_the_series_up_to_its_limits():
-    """With wheels one metre apart, `nu = m / 2` and `|beta| <= m`; alpha is a multiple of that."""
-    turns = (SHORT_TURN, -SHORT_TURN, 1e-6, 0.0)
-    for m, turn, alpha in itertools.product((SHORT_NOISE, 1e-9), turns, (0.0, -0.1, -100.0)):
-        nu, to_end = m / 2.0, complex(math.cos(turn / 2.0), -math.sin(turn / 2.0))
-        position = nu + alpha * alpha * m
-        for beta in (m, -m, 0.3 * m, 0.0):
-            short = NoiseMoments(*short_arc(alpha, turn, nu, beta, m))
-            expected = NoiseMoments(*central(series(alpha, turn, nu, beta, m), m))
-            for x, y in (('x', 'y'), ('xt', 'yt'), ('xc', 'yc'), ('xs', 'ys')):
-                turned = complex(getattr(short, x), getattr(short, y)) * to_end
-                error = turned - complex(getattr(expected, x), getattr(expected, y))
-                assert abs(error) <= 1e-13 * math.sqrt(position * m)
-            assert short.xx + short.yy == pytest.approx(expected.xx + expected.yy, rel=1e-13)
-            turned = complex(short.xx - short.yy, 2.0 * short.xy) * to_end * to_end
-            error = turned - complex(expected.xx - expected.yy, 2.0 * expected.xy)
-            assert abs(error) <= 1e-13 * position
 
 
 def test_far_from_the_origin_nothing_cancels():

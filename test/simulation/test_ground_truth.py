@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
-from support.lockstep_nodes import SECOND, Topics, change, make, make_complete
+from support.lockstep_nodes import Topics, change, make_complete
 from support.recorded import recorded
-from support.ros_messages import instants, placement, pose_of, twist, twist_stamped
+from support.ros_messages import instants, placement, pose_of, twist
 
 from diffdrive_jacobian.bags.verification import COVARIANCE_TOLERANCE, verify
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -91,38 +91,6 @@ def test_a_robot_that_assumes_its_true_dimensions_is_where_its_odometry_says(loc
     before = robot.truth - pose_of(topics.odom[-1])
     lockstep.run_for(0.2)
     assert abs(robot.truth - pose_of(topics.odom[-1]) - before).max() > 1e-3
-
-
-def drive(rate, **parameters):
-    """Drive by stamped commands that arrive late; return odometry and truth by their stamps."""
-    with Lockstep() as world:
-        truths, odometry = (world.listen(Odometry, topic) for topic in ('ground_truth', 'odom'))
-        parameters = SLIPPING | MULTIPLIERS | parameters
-        world.add(make(VirtualRobot, publish_rate=rate, enable_stamped_cmd_vel=True, **parameters))
-        for index in range(8):
-            delay = 3_456_789
-            world.run_for(0.05 - delay * 1e-9)
-            stamp = world.now
-            world.run_for(delay * 1e-9)
-            command = ((0.3, 0.0), (0.3, 2.0), (0.0, -3.0), (0.0, 0.0))[index % 4]
-            world.publish('cmd_vel', twist_stamped(*command, stamp))
-        world.run_for(0.6)
-        return tuple(dict(zip(instants(one), one, strict=True)) for one in (odometry, truths))
-
-
-def test_the_same_stamped_commands_give_the_same_truth_at_each_publish_rate():
-    """Bit for bit, except for messages that were sent before a late command came."""
-    odometry, truth = drive(10.0)
-    last = SECOND + round(0.4 * SECOND)
-    other_odometry, other = drive(50.0)
-    common = [stamp for stamp in sorted(truth.keys() & other.keys()) if stamp >= last]
-    assert len(common) >= 5
-    for stamp in common:
-        assert other[stamp].pose == truth[stamp].pose
-        assert other[stamp].twist == truth[stamp].twist
-        assert other_odometry[stamp].pose == odometry[stamp].pose
-    _, of_other_seed = drive(10.0, slip_seed=8)
-    assert of_other_seed[common[-1]].pose != truth[common[-1]].pose
 
 
 def test_initialpose_places_the_robot_and_reset_odometry_its_odometry_alone(lockstep, robot_at):

@@ -60,17 +60,6 @@ def test_exponential_coordinates_are_those_of_log():
     np.testing.assert_allclose(log_about(pose, errors), expected, atol=1e-12)
 
 
-def test_a_small_region_is_the_ellipse():
-    covariance = np.array([[4e-8, 1e-8, 1e-9], [1e-8, 2e-8, 3e-9], [1e-9, 3e-9, 1e-8]])
-    region = Region(np.array([1.0, 2.0, 0.6]), covariance, ELLIPSE_LEVEL)
-    turn = np.array([[math.cos(0.6), -math.sin(0.6)], [math.sin(0.6), math.cos(0.6)]])
-    errors = np.random.default_rng(2).normal(0.0, 3e-4, (500, 2))
-    expected = np.einsum('ni,ij,nj->n', errors @ turn, np.linalg.inv(covariance[:2, :2]), errors @ turn)
-    distance = region_distance(region, region.pose[:2] + errors)
-    near = expected < 10.0
-    np.testing.assert_allclose(distance[near], expected[near], rtol=1e-2)
-
-
 def test_a_distance_is_the_least_over_all_headings():
     """A region with an unsure heading, by brute force."""
     covariance = np.array([[0.01, 0.0, 0.0], [0.0, 0.3, 0.2], [0.0, 0.2, 0.25]])

@@ -137,16 +137,6 @@ def test_times_are_integers_of_64_bits_that_do_not_go_back():
         start().at(last + 1)
 
 
-def test_a_command_is_the_same_in_every_form():
-    for command in ((0.0, 0.0), (0.25, -1.5), (-0.0, 0.0)):
-        expected = start().commanded(command, 0)
-        for form in (list, np.array, lambda pair: np.array(pair, dtype=np.float32)):
-            robot = start().commanded(form(command), 0)
-            assert drive(robot) == drive(expected)
-            assert type(robot.command) is type(robot.twist) is tuple
-            assert all(type(part) is float for part in (*robot.command, *robot.twist))
-
-
 def test_a_robot_is_immutable_and_does_not_change_with_the_arrays_it_was_given():
     pose, covariance = START.copy(), COVARIANCE.copy()
     robot = Robot(model=HELD, stamp=0, pose=pose, covariance=covariance)

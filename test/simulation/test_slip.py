@@ -120,20 +120,6 @@ def test_a_timeout_stops_the_truth_as_well():
 # --- What the noise is
 
 
-def test_in_a_cell_the_robot_moves_along_one_arc_with_its_numbers():
-    start = driven(robot(variance=1e-4, seed=9), [((0.2, 0.5), 0)], 10 * CELL)
-    (r, left), L, k = normals(9, 0, 10), 0.16, 1e-4
-    rims = [0.2 + 0.5 * L / 2.0, 0.2 - 0.5 * L / 2.0]
-    gains = [math.sqrt(k * rim / (CELL * 1e-9)) for rim in rims]
-    true = [rim + gain * xi for rim, gain, xi in zip(rims, gains, (r, left), strict=True)]
-    twist = (true[0] + true[1]) / 2.0, (true[0] - true[1]) / L
-    assert start.true_twist == pytest.approx(twist, rel=1e-12)
-    for part in (0.25, 0.5, 1.0):
-        end = start.at(10 * CELL + round(part * CELL))
-        expected = se2.integrate(start.true_pose, twist, part * CELL * 1e-9)
-        np.testing.assert_allclose(end.true_pose, expected, rtol=1e-12)
-
-
 def test_the_slip_in_a_cell_has_the_variance_of_its_distance_whatever_the_commands():
     """Divided by xi, the slip of the whole cell is the square root of k |ds|."""
     k, cell, offsets = 1e-5, 50, (0, 3_000_000, 3_000_001, 11_000_000, 19_000_000)
