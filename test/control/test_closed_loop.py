@@ -270,7 +270,7 @@ FOLLOWING = {
 @pytest.mark.parametrize('name', FOLLOWING)
 def test_robots_that_take_time_drive_as_one_of_the_nodes_alone(name):
     law, gains = LAWS[name]
-    starts, targets = 0.3 * random_batch(7, 2)
+    starts, targets = 0.15 * random_batch(7, 2)
     arrival = Arrival(
         use_heading=name == 'pose',
         offset=gains[1] if name == 'offset_point' else 0.0,
@@ -278,7 +278,7 @@ def test_robots_that_take_time_drive_as_one_of_the_nodes_alone(name):
         rot_stopped_velocity=0.05,
     )
     model = RobotModel(limits=LIMITS, actuators=FOLLOWING[name])
-    many = {'duration': 2.5, 'arrival': arrival, 'limits': LIMITS, 'actuators': FOLLOWING[name]}
+    many = {'duration': 1.6, 'arrival': arrival, 'limits': LIMITS, 'actuators': FOLLOWING[name]}
     gone = trajectories(law, starts, targets, *gains, **many)
     assert_same(closed_loops(law, starts, targets, *gains, **many), gone.outcomes)
     for index, (start, to) in enumerate(zip(starts, targets, strict=True)):
