@@ -70,17 +70,6 @@ def test_the_path_goes_through_the_poses_with_one_tangent():
     assert 0.01 < off.max() < 0.5 * math.tan(CORNER / 2) * np.linalg.norm(chord, axis=-1).max()
 
 
-def test_it_moves_and_is_mirrored_with_its_poses():
-    positions, motion = wobbly(np.random.default_rng(3)), (3.0, -2.0, 2.5)
-    poses = np.column_stack([positions, np.zeros(len(positions))])
-    path, s = Path(positions), np.linspace(0.0, 20.0, 100)
-    assert_allclose(
-        Path(se2.compose(motion, poses)).poses_at(s), se2.compose(motion, path.poses_at(s)), atol=1e-9
-    )
-    mirrored = path.poses_at(s) * [1.0, -1.0, -1.0]
-    assert_allclose(Path(positions * [1.0, -1.0]).poses_at(s), mirrored, atol=1e-9)
-
-
 def test_a_corner_stays_a_corner_and_a_line_a_line():
     square = Path([(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)])
     assert (square.length, square.closed) == (4.0, False)

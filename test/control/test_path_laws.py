@@ -140,28 +140,6 @@ def test_pure_pursuit_drives_along_the_circle_through_the_point():
     assert at_distance == pytest.approx((V_R, 2.0 * V_R * 0.4 / 0.5**2))
 
 
-# --- Symmetry
-
-
-def answers(controller, robot, reference):
-    """Return (v, omega) or (v, omega, state), stacked."""
-    state = {'state': np.full((len(robot), 1), 0.2), 'dt': 0.02} if controller.state else {}
-    gains = controller.values(controller.defaults)
-    return np.stack([np.ravel(one) for one in controller.law(robot, reference, *gains, **state)])
-
-
-@pytest.mark.parametrize('controller', PATH_CONTROLLERS, ids=lambda one: one.name)
-def test_commutes_with_motions_of_the_plane_and_with_a_mirror(controller):
-    robot, reference, motion = poses(), poses(), np.array([3.0, -2.0, 2.5])
-    twists = answers(controller, robot, references(reference))
-    moved = answers(controller, se2.compose(motion, robot), references(se2.compose(motion, reference)))
-    assert np.allclose(moved, twists, atol=1e-9)
-    mirror = np.array([1.0, -1.0, -1.0])
-    mirrored = answers(controller, robot * mirror, references(reference * mirror, omega=-OMEGA_R))
-    mirrored[1] *= -1.0
-    assert np.allclose(mirrored, twists, atol=1e-9)
-
-
 # --- Robots that follow
 
 
