@@ -15,6 +15,7 @@ from diffdrive_jacobian.simulation.exact_moments import (
     gaussian,
     propagate_moments,
 )
+from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance
 
 L, K = 0.16, 1e-5
 START = np.array([0.7, -1.2, 0.4])
@@ -72,6 +73,16 @@ def test_the_closed_form_solves_the_differential_equation(start):
         error = np.abs(np.subtract(actual, expected))
         assert np.all(error <= 1e-12 * scales(actual)), (v, omega, duration, k, error / scales(actual))
         positive_semidefinite(actual.second_moment)
+
+
+def test_for_small_noise_it_is_the_first_order_form():
+    k, covariance = 1e-12, 1e-9 * COVARIANCE
+    for v, omega, duration in [arc for arc in ARCS if arc[2] < 100.0]:
+        exact = propagate_moments(gaussian(covariance), START, (v, omega), duration, L, k)
+        first = propagate_covariance(covariance, START, (v, omega), duration, L, k)
+        deviations = np.sqrt(np.diag(first))
+        error = np.abs(exact.second_moment - first)
+        assert np.all(error <= 1e-7 * np.outer(deviations, deviations))
 
 
 def test_far_from_the_origin_nothing_cancels():
