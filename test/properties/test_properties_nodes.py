@@ -79,19 +79,25 @@ def go_to_goal():
 # --- Status, goals and paths
 
 
-def test_a_goal_without_identifier_may_be_accepted_again_when_it_is_received_again(lockstep, scene):
+def test_only_a_goal_without_identifier_may_be_accepted_again_when_it_is_received_again(lockstep, scene):
+    uuid, goal = 0, goal_at(0.0, stamp=3)
+
     def answer(goal):
         for number in (ACCEPTED, EXECUTING, SUCCEEDED):
-            scene.send(status(number, goal.header.stamp.sec, uuid=0))
+            scene.send(status(number, goal.header.stamp.sec, uuid))
 
     lockstep.node.create_subscription(PoseStamped, 'goal_pose', answer, 10)
     lockstep.require(StatusProtocol())
-    goal = goal_at(0.0, stamp=3)
     for _ in range(3):
         lockstep.publish('goal_pose', goal)
     answer(goal)
     with pytest.raises(PropertyViolation, match=r'ACCEPTED of .* stamp 3.0+ s, which was SUC'):
         lockstep.settle()
+    lockstep.require(StatusProtocol())
+    uuid = 1
+    lockstep.publish('goal_pose', goal)
+    with pytest.raises(PropertyViolation, match='identifier 01000000'):
+        lockstep.publish('goal_pose', goal)
 
 
 def test_no_command_after_cancel(lockstep, robot_at, scene):

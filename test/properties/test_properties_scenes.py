@@ -111,6 +111,7 @@ VIOLATED = [
     (ReachesGoal(1.0, yaw_tolerance=0.1), [goal_at(1.0), odometry_at(1.0, theta=3.1), 2.0], '3.1 rad'),
     (ReachesGoal(2.0), [goal_at(1.0), odometry_at(0.0), 1.0], r'the run ended 1 s after .* run for 2 s'),
     (Settles(1.0, 0.1), [goal_at(1.0), 1.1, odometry_at(0.5), 0.1], '0.5 m from the'),
+    (Settles(1.0, 0.1), [goal_at(1.0), odometry_at(0.5), 1.5], '0.5 m from the'),
     (
         Settles(1.0, 0.1),
         [goal_at(1.0), odometry_at(1.0), 1.5, odometry_at(1.0), 1.0, odometry_at(1.11), 0.1],
