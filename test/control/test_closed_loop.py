@@ -244,6 +244,8 @@ def test_invalid_gains_and_shapes_of_options_are_named():
         for drive in (closed_loops, trajectories):
             with pytest.raises(ValueError, match=rf'\b{name}\b'):
                 drive(go_to_goal, *batch, gain, **options)
+    with pytest.raises(ValueError, match='law rejects the starts, goals and gains: d must be'):
+        closed_loops(BUILT_IN['offset_point'], *batch, 0.0)
 
 
 # --- Robots that take time
