@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -41,7 +40,7 @@ def random_batch(seed, *shape):
 
 
 def alone(law, start, to, gains, arrival, limits=FREE, *, rate=50.0, duration=6.0, r=R, separation=L):
-    """One robot in a scalar loop; gives every outcome, and its poses."""
+    """Drive one robot in a scalar loop; return every outcome, and its poses."""
     way, pose, poses, command = Waypoints(np.array([to])), start, [start], None
     time, path, effort, beyond, step = math.nan, 0.0, 0.0, 0.0, 0
     along = (to - start)[:2] / (math.dist(to[:2], start[:2]) or 1.0)
@@ -68,37 +67,33 @@ def row(outcomes, index):
     return type(outcomes)(*(field[index] for field in outcomes))
 
 
-@pytest.mark.parametrize('use_heading', [False, True], ids=['position', 'heading'])
-@pytest.mark.parametrize('limits', [FREE, LIMITS], ids=['free', 'limited'])
-@pytest.mark.parametrize('name', LAWS)
-def test_a_batch_is_each_of_its_robots_in_a_scalar_loop(name, limits, use_heading):
+@pytest.mark.parametrize(
+    ('name', 'limits'), [('go_to_goal', FREE), ('offset_point', LIMITS), ('pose', LIMITS)]
+)
+def test_a_batch_is_each_of_its_robots_in_a_scalar_loop(name, limits):
     law, gains = LAWS[name]
+    use_heading = name == 'pose'
     starts, targets = random_batch(1, 3)
     targets[0] = starts[0]
     arrival = Arrival(use_heading=use_heading, offset=gains[1] if name == 'offset_point' else 0.0)
-    how = {'duration': 4.0, 'arrival': arrival, 'limits': limits}
+    how = {'duration': 4.0, 'arrival': arrival, 'limits': limits, 'rate': 25.0}
     gone = trajectories(law, starts, targets, *gains, **how)
     assert_same(closed_loops(law, starts, targets, *gains, **how), gone.outcomes)
-    assert_allclose(gone.times, np.arange(len(gone.poses)) / 50.0, rtol=1e-12)
+    goals = targets if use_heading else targets[:, :2]
+    assert_same(closed_loops(BUILT_IN[name], starts, goals, *gains, **how), gone.outcomes)
+    assert_allclose(gone.times, np.arange(len(gone.poses)) / 25.0, rtol=1e-12)
     for index, (start, to) in enumerate(zip(starts, targets, strict=True)):
-        expected, poses = alone(law, start, to, gains, arrival, limits, duration=4.0)
+        expected, poses = alone(law, start, to, gains, arrival, limits, duration=4.0, rate=25.0)
         assert_same(row(gone.outcomes, index), expected)
         assert_allclose(gone.poses[: len(poses), index], poses, atol=1e-9)
         # Who has arrived stands still.
         assert np.all(gone.poses[len(poses) - 1 :, index] == gone.poses[-1, index])
         assert not gone.twists[len(poses) - 1 :, index].any()
     assert gone.outcomes.arrived.any()
-
-
-def test_a_single_robot_is_a_batch_without_axes():
-    (start, to), gains = random_batch(3), (6.0, 1.5)
-    expected, _ = alone(go_to_pose, start, to, gains, Arrival())
-    for found in (
-        closed_loops(go_to_pose, start, to, *gains),
-        trajectories(go_to_pose, start, to, *gains).outcomes,
-    ):
-        assert [np.shape(field) for field in found] == [()] * 5 + [(3,)]
-        assert_same(found, expected)
+    # A single robot is a batch without axes.
+    single = closed_loops(law, starts[1], targets[1], *gains, **how)
+    assert [np.shape(field) for field in single] == [()] * 5 + [(3,)]
+    assert_same(single, row(gone.outcomes, 1))
 
 
 def test_starts_gains_robots_limits_and_offsets_broadcast():
@@ -107,8 +102,9 @@ def test_starts_gains_robots_limits_and_offsets_broadcast():
     r, separation, max_v = np.array([0.02, 0.05]), np.array([0.2, 0.1]), np.array([[0.3], [np.inf]])
     min_omega = np.array([[[[-0.5]]], [[[-np.inf]]]])
     limits = VelocityLimits(max_v=max_v, min_omega=min_omega, max_wheel_speed=9.0)
-    robots = {'arrival': Arrival(offset=d), 'limits': limits, 'r': r, 'L': separation, 'duration': 3.0}
-    found = closed_loops(offset_point, starts, targets[..., :2], k, d, **robots)
+    robots = {'arrival': Arrival(offset=d), 'limits': limits, 'r': r, 'L': separation}
+    how = {'duration': 3.0, 'rate': 10.0}
+    found = closed_loops(offset_point, starts, targets[..., :2], k, d, **robots, **how)
     assert found.time.shape == (2, 2, 2, 2)
     for i, j, m, n in np.ndindex(2, 2, 2, 2):
         one, _ = alone(
@@ -118,47 +114,41 @@ def test_starts_gains_robots_limits_and_offsets_broadcast():
             VelocityLimits(max_v=max_v[m, 0], min_omega=min_omega[i, 0, 0, 0], max_wheel_speed=9.0),
             r=r[n],
             separation=separation[n],
-            duration=3.0,
+            **how,
         )
         assert_same(row(found, (i, j, m, n)), one)
-    assert len(np.unique(found.control_cost)) > 12
+    assert len(np.unique(found.control_cost)) > 10
 
 
-@pytest.mark.parametrize('block', [1, 3])
-def test_neither_order_nor_block_size_matters(monkeypatch, block):
+def test_neither_order_nor_block_size_matters_and_steps_are_reported_in_every_block(monkeypatch):
     starts, targets = random_batch(6, 5)
     Kp, arrival = np.linspace(6.0, 12.0, 5), Arrival(use_heading=True)
 
-    def drive(order, drive=closed_loops):
+    def drive(order, drive=closed_loops, **more):
         rows = starts[order], targets[order], Kp[order], 2.0
-        return drive(go_to_pose, *rows, limits=LIMITS, arrival=arrival, duration=2.0)
+        how = {'limits': LIMITS, 'arrival': arrival, 'duration': 4.0, 'rate': 25.0}
+        return drive(go_to_pose, *rows, **how, **more)
 
     expected = drive(np.arange(5))
-    monkeypatch.setattr(closed_loop, 'BLOCK', block)
+    assert not expected.arrived.all()
+    monkeypatch.setattr(closed_loop, 'BLOCK', 3)
     order = np.random.default_rng(7).permutation(5)
-    assert_same(drive(order), [field[order] for field in expected])
+    said, numbers = [], []
+    found = drive(order, progress=said.append, on_step=numbers.append)
+    assert_same(found, [field[order] for field in expected])
     assert_same(drive(order, trajectories).outcomes, [field[order] for field in expected])
+    assert all(sooner < later for sooner, later in itertools.pairwise([0, *said]))
+    assert said[-1] == 5
+    assert numbers[0] == 0
+    assert numbers == sorted(numbers)
+    # One that never arrives takes all 100 steps and the sample after the last one.
+    assert 101 <= len(numbers) <= 101 * 2
 
+    def interrupt(_):
+        raise KeyboardInterrupt
 
-def test_each_robot_turns_in_place_with_its_own_gain():
-    gains, arrival = np.array([1.0, 10.0]), Arrival(use_heading=True)
-    found = closed_loops(
-        go_to_pose, np.zeros((2, 3)), [0.0, 0.0, 1.0], 3.0, 0.5, arrival=arrival, turning_gain=gains
-    )
-    steps = np.ceil(np.log(0.02) / np.log(1.0 - gains / 50.0))
-    assert_allclose(found.time, steps / 50.0)
-    assert not found.path_length.any()
-
-
-@pytest.mark.parametrize('name', BUILT_IN)
-def test_a_controller_is_driven_as_its_checked_law(name):
-    controller, (starts, targets) = BUILT_IN[name], random_batch(13, 4)
-    goals = targets if controller.takes_heading else targets[:, :2]
-    found, expected = (
-        closed_loops(law, starts, goals, 3.0, 0.5, duration=2.0)
-        for law in (controller, lambda *each: controller.law(*each))
-    )
-    assert_same(found, expected)
+    with pytest.raises(KeyboardInterrupt):
+        drive(order, on_step=interrupt)
 
 
 # --- Who does not arrive, and who is there
@@ -175,28 +165,11 @@ def test_who_never_arrives_has_no_time_and_is_where_the_time_ran_out():
     assert_allclose(found.control_cost, 2.0 * (0.1 / R) ** 2 * np.array([4.8, 10.0, 10.0]))
 
 
-def test_the_last_sample_counts():
-    for duration, arrives in ((0.96, False), (0.98, True), (1.0, True)):
-        how = {'duration': duration, 'arrival': Arrival(xy_tolerance=0.03)}
-        found = closed_loops(lambda pose, to: (1, 0), np.zeros((1, 3)), [1.0, 0.0], **how)
-        assert found.arrived.tolist() == [arrives]
-
-
-def test_overshoot_is_measured_beyond_the_goal_along_the_line_from_the_start():
-    # A gain of 1.5 rates: each sample leaves minus half of the way.
-    c, s = math.cos(2.0), math.sin(2.0)
-    way = ([[1.0, 2.0, 2.0]], [1.0 + 3.0 * c, 2.0 + 3.0 * s])
-    found = closed_loops(go_to_goal, *way, 1e-9, 15.0, rate=10.0)
-    assert found.overshoot == pytest.approx([1.5])
-    assert found.path_length == pytest.approx([9.0], rel=0.02)
-
-
-@pytest.mark.parametrize(('wild', 'count'), [(101.0, 1), (300.0, 5), (1e4, 40)])
-@pytest.mark.parametrize('law', [offset_point, go_to_goal])
-def test_a_law_that_diverges_has_not_arrived_and_leaves_its_company_alone(law, wild, count):
+@pytest.mark.parametrize(('law', 'wild'), [(offset_point, 101.0), (go_to_goal, 1e4)])
+def test_a_law_that_diverges_has_not_arrived_and_leaves_its_company_alone(law, wild):
     """A gain beyond twice the rate."""
-    starts, targets = random_batch(8, count)
-    lost, gains = np.arange(count) == count // 2, np.full(count, 0.3)
+    starts, targets = random_batch(8, 5)
+    lost, gains = np.arange(5) == 2, np.full(5, 0.3)
 
     def drive(function=closed_loops):
         others = [gains, 0.3] if law is offset_point else [3.0, gains]
@@ -217,11 +190,6 @@ def test_who_has_driven_away_a_thousand_kilometres_is_given_up():
     assert found.pose[0] == pytest.approx(1e6, abs=2e3)
 
 
-def test_outcomes_that_overflow_are_an_error():
-    with pytest.raises(ValueError, match='must give finite outcomes'):
-        closed_loops(go_to_goal, np.zeros(3), [1.0, 0.0], 3.0, 0.5, r=1e-160)
-
-
 def test_who_is_there_has_no_use_for_the_law_any_more():
     """Which may know no direction there."""
 
@@ -229,8 +197,8 @@ def test_who_is_there_has_no_use_for_the_law_any_more():
         way = (goals - poses[:, :2])[:, 0]
         return np.where(np.abs(way) > 0.02, np.sign(way), np.nan), 0.0
 
-    starts = np.zeros((8, 3))
-    starts[1:, 0] = -np.arange(1.0, 8.0)
+    starts = np.zeros((4, 3))
+    starts[1:, 0] = -np.arange(1.0, 4.0)
     found = closed_loops(straight, starts, [0.0, 0.0])
     assert found.arrived.all()
     assert_allclose(found.time, np.maximum(-starts[:, 0] - 0.02, 0.0), atol=0.021)
@@ -249,65 +217,17 @@ def test_an_empty_batch_is_an_empty_result():
         assert (gone.poses.shape, gone.twists.shape) == ((1, *shape, 3), (0, *shape, 2))
 
 
-def test_memory_does_not_grow_with_the_duration():
-    peaks = []
-    for duration in (0.4, 0.4, 4.0):  # the first one also pays for what is made once
-        tracemalloc.start()
-        closed_loops(lambda pose, to: (0.1, 1.0), np.zeros((1000, 3)), [9.0, 0.0], duration=duration)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[2] < 1.2 * peaks[1] < 1.2e6
-
-
-@pytest.mark.parametrize('block', [5, 8192])
-def test_progress_and_steps_are_reported_in_every_block(monkeypatch, block):
-    monkeypatch.setattr(closed_loop, 'BLOCK', block)
-    starts, targets = random_batch(10, 5, 3)
-    batch, said, numbers = (go_to_goal, starts, targets[..., :2], 3.0, 0.5), [], []
-    how = {'duration': 8.0, 'rate': 20.0}
-    outcomes = closed_loops(*batch, **how, progress=said.append, on_step=numbers.append)
-    assert all(sooner < later for sooner, later in itertools.pairwise([0, *said]))
-    assert said[-1] == 15
-    assert numbers[0] == 0
-    assert numbers == sorted(numbers)
-    # One that never arrives takes all 160 steps and the sample after the last one.
-    assert not outcomes.arrived.all()
-    assert 161 <= len(numbers) <= 161 * math.ceil(15 / block)
-    assert_same(outcomes, closed_loops(*batch, **how))
-
-    def interrupt(_):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        closed_loops(*batch, on_step=interrupt)
-
-
 # --- Laws of one's own, bad input
 
 
-def test_a_law_is_any_callable_that_sees_rows_and_whatever_gains_it_was_given():
-    seen = set()
-
-    class Law:
-        def __call__(self, poses, goals, one, many):
-            seen.add((poses.shape, goals.shape, np.shape(one), np.shape(many)))
-            return 0, np.float32(1.0)
-
-    closed_loops(Law(), np.zeros((2, 3, 3)), [1.0, 0.0], 4.0, np.ones((3,)), duration=0.1)
-    assert seen == {((6, 3), (6, 2), (), (6,))}
-
-
-NO_TWISTS = [
-    *(None, 1.0, (1.0,), (1.0, 2.0, 3.0), 'vw', (1j, 0.0)),
-    *((np.zeros(3), 0.0), (0.0, [[1.0], [2.0]])),
-    *((math.nan, 0.0), (0.0, math.inf), (np.array([0.0, np.nan]), 0.0)),
-]
-
-
 def test_a_law_that_returns_something_else_is_named():
-    for twist, limits in itertools.product(NO_TWISTS, (FREE, LIMITS)):
-        with pytest.raises(ValueError, match=r'^law must .*got'):
-            closed_loops(lambda *_, twist=twist: twist, np.zeros((2, 3)), [1.0, 0.0], limits=limits)
+    for twist in (
+        *(None, 1.0, (1.0, 2.0, 3.0), 'vw', (1j, 0.0), (np.zeros(3), 0.0), (0.0, [[1.0], [2.0]])),
+        *((math.nan, 0.0), (0.0, math.inf), (np.array([0.0, np.nan]), 0.0)),
+    ):
+        for limits in (FREE, LIMITS):
+            with pytest.raises(ValueError, match=r'^law must .*got'):
+                closed_loops(lambda *_, twist=twist: twist, np.zeros((2, 3)), [1, 0], limits=limits)
 
 
 def test_invalid_gains_and_shapes_of_options_are_named():
@@ -317,15 +237,15 @@ def test_invalid_gains_and_shapes_of_options_are_named():
         *(('gain 1', bad, {}) for bad in (np.nan, np.ones(3), 'much')),
         ('max_v', 0.5, {'limits': VelocityLimits(max_v=np.ones(3))}),
         ('offset', 0.5, {'arrival': Arrival(offset=np.ones(3))}),
+        ('goals', 0.5, {'arrival': Arrival(use_heading=True)}),
+        ('finite outcomes', 0.5, {'r': 1e-160}),
+        ('max_right_speed', 0.5, {'actuators': Actuators(max_right_speed=1.0)}),
     ):
         for drive in (closed_loops, trajectories):
-            with pytest.raises(ValueError, match=rf'\b{name}\b.* must .*got'):
+            with pytest.raises(ValueError, match=rf'\b{name}\b'):
                 drive(go_to_goal, *batch, gain, **options)
-
-
-def test_headings_that_count_must_be_given():
-    with pytest.raises(ValueError, match=r'^goals must have shape \(\.\.\., 3\), got \(2,\)$'):
-        closed_loops(go_to_goal, np.zeros(3), [1.0, 0.0], 3.0, 0.5, arrival=Arrival(use_heading=True))
+    with pytest.raises(ValueError, match='law rejects the starts, goals and gains: d must be'):
+        closed_loops(BUILT_IN['offset_point'], *batch, 0.0)
 
 
 # --- Robots that take time
@@ -341,33 +261,28 @@ SLOW = AccelerationLimits(
 )
 MS = 1_000_000
 FOLLOWING = {
-    'limits': Actuators(acceleration=SLOW),
-    'wheels': Actuators(acceleration=AccelerationLimits(max_wheel_acceleration=60.0), delay=40 * MS),
-    'all': Actuators(acceleration=SLOW, lag=0.02, delay=33 * MS),
+    'pose': Actuators(acceleration=SLOW),
+    'offset_point': Actuators(
+        acceleration=AccelerationLimits(max_wheel_acceleration=60.0), delay=40 * MS
+    ),
+    'go_to_goal': Actuators(acceleration=SLOW, lag=0.02, delay=33 * MS),
 }
-AT_REST = {'trans_stopped_velocity': 0.01, 'rot_stopped_velocity': 0.05}
 
 
-@pytest.mark.parametrize(
-    ('following', 'name', 'stops'),
-    [
-        (None, 'pose', {}),
-        ('limits', 'pose', AT_REST),
-        ('wheels', 'offset_point', AT_REST),
-        ('all', 'go_to_goal', AT_REST),
-        ('all', 'offset_point', {}),
-    ],
-)
-def test_robots_drive_as_one_of_the_nodes_alone(following, name, stops):
+@pytest.mark.parametrize('name', FOLLOWING)
+def test_robots_that_take_time_drive_as_one_of_the_nodes_alone(name):
     law, gains = LAWS[name]
-    starts, targets = random_batch(7, 2)
-    offset = gains[1] if name == 'offset_point' else 0.0
-    arrival = Arrival(use_heading=name == 'pose', offset=offset, **stops)
-    actuators = FOLLOWING.get(following)
-    many = {'duration': 4.0, 'arrival': arrival, 'limits': LIMITS, 'actuators': actuators}
+    starts, targets = 0.15 * random_batch(7, 2)
+    arrival = Arrival(
+        use_heading=name == 'pose',
+        offset=gains[1] if name == 'offset_point' else 0.0,
+        trans_stopped_velocity=0.01,
+        rot_stopped_velocity=0.05,
+    )
+    model = RobotModel(limits=LIMITS, actuators=FOLLOWING[name])
+    many = {'duration': 1.6, 'arrival': arrival, 'limits': LIMITS, 'actuators': FOLLOWING[name]}
     gone = trajectories(law, starts, targets, *gains, **many)
     assert_same(closed_loops(law, starts, targets, *gains, **many), gone.outcomes)
-    model = RobotModel(limits=LIMITS, actuators=actuators)
     for index, (start, to) in enumerate(zip(starts, targets, strict=True)):
         robot, way, arrived = Robot(model=model, stamp=0, pose=start), Waypoints(to[np.newaxis]), None
         for time, pose in zip(gone.times, gone.poses[:, index], strict=True):
@@ -381,18 +296,4 @@ def test_robots_drive_as_one_of_the_nodes_alone(following, name, stops):
             robot = robot.commanded(command, robot.stamp).at(robot.stamp + 20 * MS)
         expected = math.nan if arrived is None else arrived
         assert gone.outcomes.time[index] == pytest.approx(expected, nan_ok=True)
-        if arrived is not None and arrived < 2.0:
-            # What is kept of it ends at rest.
-            assert np.abs(robot.twist).max() < 1e-8
     assert gone.outcomes.arrived.any()
-
-
-def test_a_robot_that_stops_late_overshoots():
-    slow = Actuators(
-        acceleration=AccelerationLimits(v=AxisLimits(max_acceleration=0.2, max_deceleration=-0.1))
-    )
-    found = closed_loops(go_to_goal, [0, 0, 0], [2, 0], 3.0, 1.0, actuators=slow)
-    at_once = closed_loops(go_to_goal, [0, 0, 0], [2, 0], 3.0, 1.0)
-    assert found.overshoot > 0.2 > at_once.overshoot == 0.0
-    with pytest.raises(ValueError, match='must have no max_right_speed'):
-        closed_loops(go_to_goal, [0, 0, 0], [2, 0], 3.0, 1.0, actuators=Actuators(max_right_speed=1.0))

@@ -18,18 +18,11 @@ from diffdrive_jacobian.control import (
     go_to_pose,
     offset_point,
 )
-from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.kinematics import diff_drive, se2
 from diffdrive_jacobian.simulation import closed_loops
 
 KP, KV = 3.0, 0.5  # document A's gains
 COUNT = 2_000
-LAWS = {'go_to_goal': go_to_goal, 'offset_point': offset_point, 'pose': go_to_pose}
-HEADING_COUNTS = Arrival(use_heading=True)
-
-
-def limits_of(v, omega, wheels):
-    return VelocityLimits(min_v=-v, max_v=v, min_omega=-omega, max_omega=omega, max_wheel_speed=wheels)
 
 
 def random_poses(seed, count=COUNT, size=3.0):
@@ -41,11 +34,6 @@ def random_poses(seed, count=COUNT, size=3.0):
 def random_gains(seed, count=COUNT, names=2):
     """Sluggish and wild ones."""
     return 10.0 ** np.random.default_rng(seed).uniform(-1.5, 1.5, (names, count))
-
-
-def goals_of(name, targets):
-    """The goals as a law takes them."""
-    return targets if name == 'pose' else targets[..., :2]
 
 
 def polar(states, targets):
@@ -60,31 +48,6 @@ def point(poses, d):
     """The offset point, written out."""
     x, y, theta = np.moveaxis(np.asarray(poses), -1, 0)
     return np.stack([x + d * np.cos(theta), y + d * np.sin(theta)], -1)
-
-
-# --- What all laws have in common
-
-
-@pytest.mark.parametrize('name', LAWS)
-def test_moved_to_another_place_or_mirrored_a_law_is_the_same(name):
-    law, (states, targets), motions = LAWS[name], random_poses(3), random_poses(4)[0]
-
-    def twists(states, targets):
-        return np.array(law(states, goals_of(name, targets), KP, KV))
-
-    here = twists(states, targets)
-    moved = twists(se2.compose(motions, states), se2.compose(motions, targets))
-    assert_allclose(moved, here, rtol=1e-8, atol=1e-8)
-    mirror = np.array([1.0, -1.0, -1.0])
-    # Not every library's sine is exactly odd.
-    assert_allclose(twists(mirror * states, mirror * targets), [here[0], -here[1]], atol=1e-12)
-
-
-@pytest.mark.parametrize('name', BUILT_IN)
-def test_a_law_and_its_unchecked_equation_agree(name):
-    law, (states, targets) = BUILT_IN[name].law, random_poses(5, 50)
-    goals, gains = goals_of(name, targets), random_gains(6, 50)
-    np.testing.assert_array_equal(law.formula(states.T, goals.T, *gains), law(states, goals, *gains))
 
 
 # --- Document A
@@ -118,11 +81,6 @@ def test_go_to_goal_is_document_as():
     assert_allclose(d_dot, -gains[1] * distance * np.cos(error) ** 2, rtol=1e-9, atol=1e-12)
 
 
-def test_go_to_goal_arrives_from_every_start():
-    states, targets = random_poses(9, 500)
-    assert closed_loops(go_to_goal, states, targets[:, :2], KP, KV, duration=20.0).arrived.all()
-
-
 # --- Document B: the offset point goes straight to its goal, like exp(-k t)
 
 
@@ -143,9 +101,6 @@ def test_the_offset_point_moves_straight_towards_its_goal_whatever_the_heading()
     goals = targets[:, :2]
     v, omega = offset_point(states, goals, k, d)
     wanted = k[:, np.newaxis] * (goals - point(states, d))
-    c, s = np.cos(states[:, 2]), np.sin(states[:, 2])
-    moves = np.stack([v * c - d * omega * s, v * s + d * omega * c], -1)
-    assert_allclose(moves, wanted, rtol=1e-10, atol=1e-10)
     # With document B's Jacobian, whatever the wheels.
     r, L = np.random.default_rng(15).uniform([[0.01], [0.1]], [[0.1], [0.6]], (2, COUNT))
     wheels = np.stack(diff_drive.body_to_wheel(v, omega, r, L), -1)
@@ -157,10 +112,10 @@ def test_the_offset_point_moves_straight_towards_its_goal_whatever_the_heading()
 
 
 def test_the_offset_point_arrives_when_it_should_with_the_axle_beside_the_goal():
-    (states, targets), d = random_poses(17, 500), random_offsets(18, 500)
+    (states, targets), d = random_poses(17, 200), random_offsets(18, 200)
     d += np.copysign(0.2, d)
-    states[:100, 2], goals = np.pi, targets[:, :2]
-    goals[:50] = states[:50, :2] + [3.0, 0.0]  # exactly behind
+    states[:40, 2], goals = np.pi, targets[:, :2]
+    goals[:20] = states[:20, :2] + [3.0, 0.0]  # exactly behind
     found = closed_loops(offset_point, states, goals, 1.0, d, duration=15.0, arrival=Arrival(offset=d))
     assert found.arrived.all()
     assert np.hypot(*(point(found.pose, d) - goals).T).max() <= 0.02
@@ -199,69 +154,44 @@ def test_without_a_weight_the_heading_converges_at_critical_damping_or_twice_as_
     weight = np.where(ratio <= 4.0, (ratio / 2.0) ** 2, 2.0 * ratio - 4.0)
     given = go_to_pose(states, targets, Kp, Kv, weight)
     assert_allclose(go_to_pose(states, targets, Kp, Kv), given, rtol=1e-9, atol=1e-9)
-    # Near the goal heading and bearing settle like s^2 + Kp s + Kv^2 h: see where its roots lie.
-    for kp, kv, h in zip(Kp[:100], Kv[:100], weight[:100], strict=True):
-        slowest = np.roots([1.0, kp, kv * kv * h]).real.max()
-        expected = -kp / 2.0 if kp <= 4.0 * kv else -2.0 * kv
-        assert slowest == pytest.approx(expected, rel=1e-6)
 
 
-def test_on_the_position_it_stands_still_whatever_the_headings():
+def test_at_the_position_the_commands_are_zero_whatever_the_headings():
     states, targets = random_poses(23, 1000)
     targets[:, :2] = states[:, :2]
     assert not np.any(go_to_pose(states, targets, KP, KV))
     assert not np.any(go_to_goal(states, targets[:, :2], KP, KV))
-    for theta in (0.0, -0.0, math.pi, -math.pi, 2.0):
-        for x in (0.0, -0.0):
-            assert go_to_pose([x, x, theta], [0.0, -0.0, 1.0], KP, KV) == (0.0, 0.0)
+    for theta in (0.0, -0.0, math.pi, -math.pi):
+        assert go_to_pose([-0.0, 0.0, theta], [0.0, -0.0, 1.0], KP, KV) == (0.0, 0.0)
 
 
-def test_the_lyapunov_function_never_grows_along_the_polar_equations():
-    (states, targets), (Kp, Kv, h) = random_poses(24), random_gains(25, names=3)
-    rho, alpha, phi = polar(states, targets)
-    v, omega = go_to_pose(states, targets, Kp, Kv, h)
-    rho_dot = -v * np.cos(alpha)
-    phi_dot = v * np.sin(alpha) / rho
-    alpha_dot = phi_dot - omega
-    terms = 2.0 * np.array([rho * rho_dot, alpha * alpha_dot, h * phi * phi_dot])
-    rounding = 1e-12 * np.abs(terms).max(axis=0)
-    V_dot = terms.sum(axis=0)
-    assert np.all(V_dot <= rounding)
-    exact = -2.0 * (Kv * (rho * np.cos(alpha)) ** 2 + Kp * alpha**2)
-    assert np.all(np.abs(V_dot - exact) <= rounding)
-    # The polar equations are the robot's motion.
-    dt = 1e-7
-    moved = se2.integrate(states, np.stack([v, omega], -1), dt)
-    rates = (np.array(polar(moved, targets)) - [rho, alpha, phi]) / dt
-    smooth = (np.pi - np.abs([alpha, phi])).min(axis=0) > 0.01
-    allowed = 1e-4 * (1.0 + (np.abs(v) / rho + np.abs(omega)) ** 2) * (1.0 + rho)
-    for rate, expected in zip(rates, (rho_dot, alpha_dot, phi_dot), strict=True):
-        assert np.all(np.abs(rate - expected)[smooth] <= allowed[smooth])
-    assert np.mean(smooth) > 0.98
+# --- Robots that are driven to the end
 
 
-# --- Robots that go_to_pose drives
-
-
-@pytest.mark.parametrize('case', ['free', 'limited', 'forwards', 'near'])
-def test_poses_are_taken_from_everywhere(case):
-    states, targets = random_poses(28, 200, {'near': 0.05, 'limited': 1.5}.get(case, 3.0))
-    gains, limits = (KP, KV), VelocityLimits()
-    if case == 'limited':
-        # Under limits the paths are shorter: several of them take long all the same.
-        limits = limits_of(0.22, 2.84, 6.67)
-        states, targets = states[:100], targets[:100]
-    if case == 'forwards':
-        # A robot that may not back up, whatever the gains.
-        gains, limits = (np.repeat([6.0, 12.0, 24.0, 45.0], 50), 0.5), VelocityLimits(min_v=0.0)
-    if case == 'near':
-        # With headings beside pi, exactly behind, and with other gains.
-        states[::2, 2], targets[::3, 2] = np.pi, -np.pi
-        states[::5, :2], targets[::7, :2] = [0.3, 0.0], 0.0
-        Kv, ratio = np.random.default_rng(29).uniform([[0.3], [1.0]], [[2.0], [10.0]], (2, 200))
-        gains = Kv * ratio, Kv
-    how = {'arrival': HEADING_COUNTS, 'limits': limits, 'duration': 90.0}
-    found = closed_loops(go_to_pose, states, targets, *gains, **how)
+def test_poses_are_reached_from_everywhere():
+    """A batch of robots without limits, within limits, and that may not back up, with other gains."""
+    # The first 40 have no limits.
+    limited, forwards, near = slice(40, 80), slice(80, 120), slice(120, 160)
+    states, targets = random_poses(28, 160, 1.5)
+    # Under limits the paths are shorter: several of them take long all the same.
+    states[limited], targets[limited] = random_poses(30, 40, 0.7)
+    states[near], targets[near] = random_poses(29, 40, 0.05)
+    # Exactly behind, and with headings of pi.
+    states[120::2, 2], targets[120::3, 2] = np.pi, -np.pi
+    states[120::5, :2], targets[120::7, :2] = [0.3, 0.0], 0.0
+    Kp, Kv = np.full((2, 160), [[KP], [KV]])
+    Kp[forwards] = np.repeat([6.0, 12.0, 24.0, 45.0], 10)
+    Kv[near], ratio = np.random.default_rng(29).uniform([[0.3], [1.0]], [[2.0], [10.0]], (2, 40))
+    Kp[near] = Kv[near] * ratio
+    v, omega, wheels = np.full((3, 160), np.inf)
+    v[limited], omega[limited], wheels[limited] = 0.22, 2.84, 6.67
+    min_v = -v
+    min_v[forwards] = 0.0
+    limits = VelocityLimits(
+        min_v=min_v, max_v=v, min_omega=-omega, max_omega=omega, max_wheel_speed=wheels
+    )
+    how = {'arrival': Arrival(use_heading=True), 'limits': limits, 'duration': 90.0}
+    found = closed_loops(go_to_pose, states, targets, Kp, Kv, **how)
     off = np.hypot(*(found.pose - targets).T[:2])
     turned = np.abs(se2.wrap_angle((found.pose - targets)[:, 2]))
     failed = np.flatnonzero(~found.arrived | (off > 0.02) | (turned > 0.02))

@@ -5,59 +5,33 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from own_laws import Site, example
+from support import commands
 from support.lockstep_nodes import SUCCEEDED, Topics, arrives, change, make
 from support.ros_messages import goal, pose_of
 
 from diffdrive_jacobian import control
-from diffdrive_jacobian.control import KP, Gain, LawError
+from diffdrive_jacobian.control import KP, KV, OFFSET, Gain, LawError
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.numerics.formula import formula
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
-from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.plots.sweep_figure import figure
 from diffdrive_jacobian.simulation import SweepSetup, closed_loops, sweep, sweep_table
 from diffdrive_jacobian.tools import sweep_gains
-from diffdrive_jacobian.tools.run_node import run_node
-
-PAGE = (Path(__file__).parents[2] / 'doc' / 'controllers.md').read_text()
-SOURCES = dict(re.findall(r'```python\n# (polar|integral)\.py\n(.*?)```', PAGE, re.DOTALL))
-
-
-def example(name):
-    namespace = {}
-    exec(SOURCES[name], namespace)
-    return namespace['CONTROLLER']
-
 
 POLAR, INTEGRAL = example('polar'), example('integral')
 
 
 @pytest.fixture
-def install(tmp_path, monkeypatch):
-    """Install an example as a package; return its name."""
-
-    def install(name):
-        module = f'{name}_{tmp_path.name.replace("-", "_")}'
-        (tmp_path / f'{module}.py').write_text(SOURCES[name])
-        information = tmp_path / f'{module}-1.0.dist-info'
-        information.mkdir()
-        (information / 'METADATA').write_text(f'Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n')
-        (information / 'entry_points.txt').write_text(
-            f'[diffdrive_jacobian.controllers]\n{name} = {module}:CONTROLLER\n'
-        )
-        monkeypatch.syspath_prepend(str(tmp_path))
-        monkeypatch.setattr('diffdrive_jacobian.control.controllers._loaded', {})
-        settings.gains.cache_clear()
-        return name
-
-    return install
+def site(tmp_path, monkeypatch):
+    return Site(tmp_path / 'site', monkeypatch)
 
 
 # --- Parameters of the node
@@ -67,7 +41,7 @@ def test_a_law_with_three_gains_drives_to_a_pose(lockstep):
     topics = Topics(lockstep)
     lockstep.add(make(VirtualRobot))
     node = lockstep.add(GoToGoal(controller=POLAR))
-    assert change(node, k_alpha=4.0, k_rho=1.0, k_beta=-1.0).successful
+    assert change(node, k_alpha=12.0, k_rho=3.0, k_beta=-3.0).successful
     lockstep.publish('goal_pose', goal(-0.4, 0.2, 1.0))
     arrives(lockstep, topics)
     assert topics.statuses[-1] == SUCCEEDED
@@ -76,8 +50,9 @@ def test_a_law_with_three_gains_drives_to_a_pose(lockstep):
     assert abs(theta - 1.0) < 0.021
 
 
-def test_gains_of_an_installed_controller_are_parameters_from_the_start(lockstep, install):
-    node = lockstep.add(make(GoToGoal, controller=install('polar'), k_rho=0.7))
+def test_gains_of_an_installed_controller_are_parameters_from_the_start(lockstep, site):
+    site.install('polar')
+    node = lockstep.add(make(GoToGoal, controller='polar', k_rho=0.7))
     assert node.parameters.k_rho == 0.7
     assert node.get_parameter('k_beta').value == -0.5
     (described,) = node.describe_parameters(['k_beta'])
@@ -91,14 +66,14 @@ def test_gains_of_an_installed_controller_are_parameters_from_the_start(lockstep
         make(GoToGoal, controller='polar', k_rho=-1.0)
 
 
-def test_gains_are_declared_when_their_controller_is_chosen(lockstep, install, capfd):
+def test_gains_are_declared_when_their_controller_is_chosen(lockstep, site):
+    site.install('polar')
     node = lockstep.add(make(GoToGoal, k_rho=0.7, k_alpha=-1.0))
     assert not node.has_parameter('k_rho')
-    assert change(node, controller=install('polar')).successful
+    assert change(node, controller='polar').successful
     # Given at the start. The other one is out of range.
     assert node.get_parameter('k_rho').value == node.parameters.k_rho == 0.7
     assert change(node, k_beta=-2.0).successful
-    assert node.parameters.k_beta == -2.0
     assert change(node, controller='go_to_goal').successful
     assert change(node, controller='polar').successful
     assert node.parameters.k_beta == -2.0
@@ -107,7 +82,8 @@ def test_gains_are_declared_when_their_controller_is_chosen(lockstep, install, c
 def test_the_default_of_a_shared_gain_is_that_of_the_controller_chosen():
     own = replace(INTEGRAL, gains=(replace(KP, default=1.5), *INTEGRAL.gains[1:]))
     assert GoToGoalParameters.with_controller(own).extended({})().kp == 1.5
-    assert GoToGoalParameters().kp == 3.0
+    parameters = GoToGoalParameters()
+    assert (parameters.kp, parameters.kv, parameters.offset) == (3.0, 0.5, 0.1)
 
 
 def test_a_gain_cannot_take_a_name_that_the_node_uses_or_another_range(lockstep):
@@ -124,21 +100,12 @@ def test_a_gain_cannot_take_a_name_that_the_node_uses_or_another_range(lockstep)
             GoToGoal(controller=replace(POLAR, gains=(gain, *POLAR.gains[1:])))
 
 
-def test_help_describes_the_gains_of_the_controller_that_is_chosen(install, capsys):
-    name = install('polar')
-    with pytest.raises(SystemExit):
-        run_node('go_to_goal', ['--help', '--ros-args', '-p', f'controller:={name}'], Signals())
-    assert 'Gain on the bearing [1/s]. Must be in [0, 20]' in capsys.readouterr().out
-    with pytest.raises(SystemExit):
-        sweep_gains.main(['--controller', name, '--help'], Signals())
-    assert '--k_alpha' in capsys.readouterr().out
-
-
-# --- The page
-
-
-def test_the_page_offers_the_gains_of_the_controller(install):
-    values = {'controller': {'controller': install('polar'), 'k_rho': 0.5, 'k_alpha': 2.0, 'kp': 3.0}}
+def test_help_and_the_page_describe_the_gains_of_the_controller_that_is_chosen(site):
+    site.install('polar')
+    of_node = commands.run('go_to_goal', '--help', '--ros-args', '-p', 'controller:=polar')
+    assert 'Gain on the bearing [1/s]. Must be in [0, 20]' in of_node.out
+    assert '--k_alpha' in commands.run('sweep_gains', '--controller', 'polar', '--help').out
+    values = {'controller': {'controller': 'polar', 'k_rho': 0.5, 'k_alpha': 2.0, 'kp': 3.0}}
     rows = {row['key']: row for row in settings.shown(values, settings.gains('polar'))}
     assert rows['controller/k_alpha']['hint'] == 'Gain on the bearing'
     assert (rows['controller/k_alpha']['low'], rows['controller/k_alpha']['high']) == (0.2, 6.0)
@@ -149,13 +116,12 @@ def test_the_page_offers_the_gains_of_the_controller(install):
 # --- Sweeps
 
 
-@pytest.mark.slow
-def test_three_gains_are_swept_two_at_a_time(install, tmp_path, monkeypatch, capsys):
+def test_three_gains_are_swept_two_at_a_time_and_drawn():
     gains = {'k_alpha': (1.5, 3.0), 'k_beta': -0.3}
-    setup = SweepSetup(controller=POLAR, gains=gains, grid=3, starts=2, rate=10.0)
+    setup = SweepSetup(controller=POLAR, gains=gains, grid=3, starts=2, rate=10.0, duration=40.0)
     assert [gain.name for gain in setup.axes] == ['k_rho', 'k_alpha']
     swept = sweep(setup)
-    # 0.05/s is too slow for a minute.
+    # 0.05/s is too slow.
     assert swept.complete.tolist() == [[False, True, True]] * 3
     header, *rows = sweep_table(swept).splitlines()
     assert header.startswith('k_rho_per_s,k_alpha_per_s,starts,arrived,time_mean_s,')
@@ -163,12 +129,76 @@ def test_three_gains_are_swept_two_at_a_time(install, tmp_path, monkeypatch, cap
     how = {'arrival': setup.arrival, 'rate': 10.0}
     alone = closed_loops(POLAR, setup.poses(), np.zeros(3), 0.775, 1.5, -0.3, **how)
     np.testing.assert_array_equal(alone.time, swept.outcomes.time[0, 1])
+    drawn = figure(swept)
+    assert drawn.get_suptitle().startswith('polar: ')
+    texts = [text.get_text() for text in drawn.axes[3].get_legend().get_texts()]
+    assert 'defaults: k_rho 0.5, k_alpha 2' in texts
+
+
+SMALL = ('--grid', '2', '--starts', '1', '--rate', '10', '--csv', 'a.csv')
+
+
+def test_an_installed_controller_is_swept_by_the_tool(site, tmp_path, monkeypatch):
+    site.install('polar')
+    site.install('unswept', 'raise RuntimeError("no licence")')
     monkeypatch.chdir(tmp_path)
-    arguments = ['--controller', install('polar'), '--k_beta', ' -0.8', ' -0.2', '--k_rho', '0.5']
-    small = ['--grid', '2', '--starts', '2', '--rate', '10', '--csv', 'a.csv', '-o', 'a.png']
-    assert sweep_gains.main([*arguments, *small], Signals()) == 0
-    assert (tmp_path / 'a.csv').read_text().startswith('k_alpha_per_s,k_beta_per_s,')
-    assert 'fastest: k_alpha' in capsys.readouterr().out
+    arguments = ('--controller', 'polar', '--k_beta', ' -0.8', ' -0.2', '--k_rho', '0.5', *SMALL)
+    ended = commands.run('sweep_gains', *arguments)
+    assert ended.code == 0
+    assert 'fastest: k_alpha' in ended.out
+    header, *rows = (tmp_path / 'a.csv').read_text().splitlines()
+    assert header.startswith('k_alpha_per_s,k_beta_per_s,')
+    assert len(rows) == 4
+    ended = commands.run('sweep_gains', '--controller', 'unswept', '--csv', 'b.csv')
+    assert ended.code == 2
+    assert 'cannot be loaded: RuntimeError: no licence' in ended.err
+
+
+def test_gains_named_as_options_are_swept_under_another_name(monkeypatch, tmp_path):
+    odd = replace(
+        POLAR,
+        gains=(
+            Gain(name='grid', default=0.5, bounds=(0.0, 10.0)),
+            Gain(name='max_velocity', default=2.0, bounds=(0.0, 20.0)),
+            Gain(name='k_beta', default=-0.5),
+        ),
+    )
+    monkeypatch.setattr(sweep_gains.CONTROLLERS, '_given', {'polar': odd})
+    monkeypatch.chdir(tmp_path)
+    arguments = ('--controller', 'polar', '--gain-grid', '0.3', '0.6', '--gain-max_velocity', '1', '2')
+    more = ('--k_beta', '-0.3', '--max-velocity', '1', *SMALL)
+    ended = commands.run('sweep_gains', *arguments, *more)
+    assert ended.code == 0
+    assert 'fastest: grid 0.6, max_velocity' in ended.out
+
+
+def test_a_driven_point_is_swept_with_its_offset():
+    controller = control.Controller(
+        name='point',
+        law=lambda poses, goals, kp, kv, d: control.offset_point(poses, goals, kv, d),
+        gains=(KP, KV, OFFSET),
+        offset='offset',
+    )
+    gains = {'kp': (2.0, 4.0), 'kv': (0.5, 1.0), 'offset': -0.3}
+    swept = sweep(SweepSetup(gains=gains, grid=2, starts=2, rate=20.0, controller=controller))
+    assert swept.complete.all()
+    x, y = swept.outcomes.pose[..., 0], swept.outcomes.pose[..., 1]
+    assert np.hypot(x, y) == pytest.approx(0.3, abs=0.021)
+
+
+def test_what_cannot_be_swept_is_refused():
+    setup = SweepSetup(starts=2)
+    with pytest.raises(ValueError, match="two gains to be swept, but 'polar' has k_rho"):
+        replace(setup, controller=replace(POLAR, gains=POLAR.gains[:1]))
+    scalar = replace(POLAR, law=lambda pose, to, *_: (math.hypot(to[0] - pose[0], 0.0), 0.0))
+    words = r"'polar' must accept poses of shape \(2, 3\) to be swept, but failed: "
+    with pytest.raises(ValueError, match=words):
+        sweep(replace(setup, controller=scalar))
+    for bad in ('x', (1.0,), math.nan):
+        with pytest.raises(ValueError, match='kp must be'):
+            SweepSetup(gains={'kp': bad})
+    with pytest.raises(ValueError, match='gains must be of class Mapping'):
+        SweepSetup(gains=[('kp', 1.0)])
 
 
 # --- A state
@@ -198,37 +228,27 @@ def test_a_state_is_kept_during_a_goal_and_begins_anew_with_the_next(lockstep):
 
 
 def test_the_integral_removes_a_bias_in_node_and_batch_alike():
-    def biased(controller):
-        def law(*arguments, **more):
-            v, omega, *state = controller.law(*arguments, **more)
-            return (v, omega - 1.0, *state)
+    def biased(*arguments, **more):
+        v, omega, *state = INTEGRAL.law(*arguments, **more)
+        return (v, omega - 1.0, *state)
 
-        return replace(controller, law=law)
-
-    ends = []
+    controller, ends = replace(INTEGRAL, law=biased), []
     for ki in (0.0, 2.0):
-        bound = biased(INTEGRAL).bind(SimpleNamespace(kp=2.0, kv=0.0, ki=ki))
-        theta = 0.3
+        bound, theta = controller.bind(SimpleNamespace(kp=2.0, kv=0.0, ki=ki)), 0.3
         for step in range(250):
             bound.now = step * 20_000_000
             _, omega = bound((0.0, 0.0, theta), (1.0, 0.0, 0.0))
             theta += omega * 0.02
         ends.append(theta)
-        batch = closed_loops(biased(INTEGRAL), [[0.0, 0.0, 0.3]], [1.0, 0.0], 2.0, 0.0, ki, duration=5.0)
+        # The robots of a batch have states of their own.
+        starts = [[0.0, 0.0, 0.3], [-1.0, 0.5, 2.0]]
+        batch = closed_loops(controller, starts, [1.0, 0.0], 2.0, 0.0, ki, duration=5.0)
         assert batch.pose[0, 2] == pytest.approx(theta, abs=1e-12)
     assert ends[0] == pytest.approx(-0.5, abs=2e-3)
     assert abs(ends[1]) < 2e-2
 
 
-def test_robots_of_a_batch_have_states_of_their_own():
-    poses = np.array([[0.0, 0.0, 0.0], [-1.0, 0.5, 2.0], [0.3, 0.0, -1.0]])
-    together = closed_loops(INTEGRAL, poses, [1.0, 0.0], 3.0, 0.5, 0.7)
-    for index, pose in enumerate(poses):
-        alone = closed_loops(INTEGRAL, [pose], [1.0, 0.0], 3.0, 0.5, 0.7)
-        np.testing.assert_array_equal(alone.pose[0], together.pose[index])
-
-
-def test_an_equation_may_have_a_state_too():
+def test_an_equation_may_have_a_state_too_and_time_that_goes_back_is_no_time():
     @formula('(3),(2),(),(1),() -> (),(),(1)')
     def law(pose, goal, kp, state, dt):
         (total,) = state
@@ -236,11 +256,11 @@ def test_an_equation_may_have_a_state_too():
 
     own = control.Controller(name='equation', law=law, gains=(KP,), state=(1.0,))
     bound = own.bind(SimpleNamespace(kp=2.0))
-    assert bound(np.zeros(3), np.zeros(2)) == (0.0, 2.0)
-    bound.now = 500_000_000
-    assert bound(np.zeros(3), np.zeros(2)) == (0.0, 2.0)
-    bound.now = 10**9
-    assert bound(np.zeros(3), np.zeros(2)) == (0.0, 3.0)
+    turned = []
+    for bound.now in (0, 500_000_000, 10**9, 8 * 10**8, 10**9, 10**9):
+        _, omega = bound(np.zeros(3), np.zeros(2))
+        turned.append(omega)
+    assert turned == pytest.approx([2.0, 2.0, 3.0, 4.0, 4.0, 4.4])
     ended = closed_loops(own, [[0.0, 0.0, 0.0]] * 2, [1.0, 0.0], 2.0, rate=10.0, duration=0.3)
     assert ended.pose[:, 2] == pytest.approx([0.1 * 2.0 * (1.0 + 1.0 + 1.1)] * 2)
 
@@ -254,42 +274,3 @@ def test_an_invalid_state_is_named():
         own = replace(INTEGRAL, law=lambda *_, result=result, **__: result)
         with pytest.raises(LawError, match=re.escape(words)):
             own.bind(SimpleNamespace(kp=1.0, kv=1.0, ki=1.0))(np.zeros(3), np.ones(3))
-
-
-def test_time_that_goes_back_is_no_time():
-    seen = []
-
-    def law(pose, to, kp, state, dt):
-        seen.append(dt)
-        return 0.0, 0.0, state
-
-    own = control.Controller(name='back', law=law, gains=(KP,), state=(0.0,))
-    bound = own.bind(SimpleNamespace(kp=1.0))
-    for bound.now in (10**9, 5 * 10**8, 10**9):
-        bound(np.zeros(3), np.zeros(2))
-    assert seen == [0.0, 0.0, 0.5]
-
-
-def test_gains_named_as_options_are_swept_under_another_name(capsys, monkeypatch, tmp_path):
-    odd = replace(
-        POLAR,
-        gains=(
-            Gain(name='grid', default=0.5, bounds=(0.0, 10.0)),
-            Gain(name='max_velocity', default=2.0, bounds=(0.0, 20.0)),
-            Gain(name='k_beta', default=-0.5),
-        ),
-    )
-    monkeypatch.setattr(sweep_gains.CONTROLLERS, '_given', {'polar': odd})
-    monkeypatch.chdir(tmp_path)
-    arguments = ['--controller', 'polar', '--gain-grid', '0.3', '0.6', '--gain-max_velocity', '1', '2']
-    more = ['--k_beta', '-0.3', '--max-velocity', '1', '--grid', '2', '--starts', '1', '--csv', 'a.csv']
-    assert sweep_gains.main([*arguments, *more], Signals()) == 0
-    assert 'fastest: grid 0.6, max_velocity' in capsys.readouterr().out
-
-
-def test_gains_of_a_setup_are_numbers_or_ranges():
-    for bad in ('x', None, (1.0,), [1.0, 2.0, 3.0], 1j, math.nan):
-        with pytest.raises(ValueError, match='kp must be'):
-            SweepSetup(gains={'kp': bad})
-    with pytest.raises(ValueError, match='gains must be of class Mapping'):
-        SweepSetup(gains=[('kp', 1.0)])

@@ -11,20 +11,20 @@ from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 R, L = 0.033, 0.16
 BODY_LIMITS = ['min_v', 'max_v', 'min_omega', 'max_omega']
 EVERY_LIMIT = [*BODY_LIMITS, 'max_wheel_speed']
-ACTIVE = [*([name] for name in EVERY_LIMIT), BODY_LIMITS, EVERY_LIMIT]
 
 
-def random_limits(rng, names, *shape):
-    """Draw limits around the size of the commands, so that each of them is often the tightest."""
-    drawn = {name: 10.0 ** rng.uniform(-3.0, 0.5, shape) for name in names}
-    for name in drawn:
-        drawn[name] *= {'min': -1.0, 'max': 1.0}[name[:3]] / (R if name == 'max_wheel_speed' else 1.0)
+def random_limits(rng, count):
+    """Draw limits around the size of the commands; a random half of them is infinite: none."""
+    drawn = {name: 10.0 ** rng.uniform(-3.0, 0.5, count) for name in EVERY_LIMIT}
+    for name, values in drawn.items():
+        values *= -1.0 if name.startswith('min') else 1.0 / R if 'wheel' in name else 1.0
+        values[rng.random(count) < 0.5] *= np.inf
     return drawn
 
 
-def random_commands(rng, *shape):
-    """Draw commands over six decades and all four quadrants."""
-    return rng.choice([-1.0, 1.0], (2, *shape)) * 10.0 ** rng.uniform(-4.0, 2.0, (2, *shape))
+def random_commands(rng, count):
+    """Draw commands over six decades and all four quadrants, shape (2, count)."""
+    return rng.choice([-1.0, 1.0], (2, count)) * 10.0 ** rng.uniform(-4.0, 2.0, (2, count))
 
 
 def fastest_wheel(v, omega):
@@ -39,26 +39,23 @@ def violates(limits, v, omega):
     return body | (fastest_wheel(v, omega) > limits.max_wheel_speed)
 
 
-@pytest.mark.parametrize('names', ACTIVE, ids='+'.join)
-def test_the_curvature_is_kept_and_no_larger_factor_meets_the_limits(names):
+def test_the_curvature_is_kept_and_no_larger_factor_meets_the_limits():
     rng = np.random.default_rng(1)
-    limits = VelocityLimits(**random_limits(rng, names, 5_000))
-    v, omega = random_commands(rng, 5_000)
+    limits = VelocityLimits(**random_limits(rng, 20_000))
+    v, omega = random_commands(rng, 20_000)
     limited = v_limited, omega_limited = saturate(v, omega, limits, R, L)
     np.testing.assert_allclose(v_limited / omega_limited, v / omega, rtol=1e-12)
     assert np.all(np.sign(v_limited) == np.sign(v))
-    assert np.all((limits.min_v <= v_limited) & (v_limited <= limits.max_v))
-    assert np.all((limits.min_omega <= omega_limited) & (omega_limited <= limits.max_omega))
-    # Not by a single bit, but slower only by a few units in the last place.
-    assert np.all(fastest_wheel(*limited) <= limits.max_wheel_speed)
+    # Not beyond a limit by a single bit, but slower only by a few units in the last place.
+    assert not violates(limits, *limited).any()
     unchanged = (v_limited == v) & (omega_limited == omega)
     assert np.all(unchanged | violates(limits, *np.multiply(limited, 1.0 + 3e-15)))
-    # Only what breaks a limit is slowed down, and what is within them passes to the last bit.
+    # What is within the limits passes to the last bit.
     assert np.array_equal(unchanged, ~violates(limits, v, omega))
-    assert np.count_nonzero(unchanged) < 4_500
+    assert 2_000 < np.count_nonzero(unchanged) < 18_000
     inside = np.multiply(limited, 1.0 - 1e-9)
     assert np.array_equal(saturate(*inside, limits, R, L), inside)
-    assert saturate(0.0, 0.0, VelocityLimits(**random_limits(rng, names)), R, L) == (0.0, 0.0)
+    assert not np.any(saturate(0.0, 0.0, limits, R, L))
 
 
 def test_without_limits_everything_passes():
@@ -66,7 +63,9 @@ def test_without_limits_everything_passes():
     assert limits.unlimited
     assert not VelocityLimits(max_wheel_speed=1e9).unlimited
     twists = random_commands(np.random.default_rng(4), 100)
-    assert np.array_equal(saturate(*twists, limits, R, L), twists)
+    assert np.array_equal(saturate(*twists, limits), twists)
+    # The wheels are needed only for their limit.
+    assert saturate(1.0, 2.0, VelocityLimits(max_v=0.5)) == (0.5, 1.0)
 
 
 @pytest.mark.parametrize('name', BODY_LIMITS)
@@ -75,9 +74,8 @@ def test_a_limit_of_zero_forbids_a_direction_and_leaves_the_rest(name):
     twist = random_commands(np.random.default_rng(5), 100)
     component = 0 if name.endswith('_v') else 1
     forbidden = (twist[component] < 0.0) if name.startswith('min') else (twist[component] > 0.0)
-    assert 20 < np.count_nonzero(forbidden) < 80
     limited = np.array(saturate(*twist, limits, R, L))
-    # As if the forbidden component had not been asked for: nothing of it, and nothing less of the other.
+    # As if the forbidden component had not been commanded, and nothing less of the other.
     dropped = twist.copy()
     dropped[component, forbidden] = 0.0
     assert np.array_equal(limited, saturate(*dropped, VelocityLimits(max_wheel_speed=20.0), R, L))
@@ -90,32 +88,11 @@ def test_a_limit_of_zero_forbids_a_direction_and_leaves_the_rest(name):
     assert np.array_equal(both[1 - component], twist[1 - component])
 
 
-def test_commands_robots_and_limits_broadcast():
-    rng = np.random.default_rng(8)
-    drawn = random_limits(rng, EVERY_LIMIT, 4)
-    for index, name in enumerate(BODY_LIMITS):
-        # Some limits are zero, some are none.
-        drawn[name][index] = 0.0
-        drawn[name][index - 1] = -np.inf if name.startswith('min') else np.inf
-    v, omega = random_commands(rng, 4)
-    r, separation = rng.uniform(0.01, 0.1, (3, 1)), rng.uniform(0.1, 0.5, (3, 1))
-    limited = saturate(v, omega, VelocityLimits(**drawn), r, separation)
-    for i, j in np.ndindex(3, 4):
-        limits = VelocityLimits(**{name: float(values[j]) for name, values in drawn.items()})
-        one = saturate(v[j], omega[j], limits, r[i, 0], separation[i, 0])
-        assert (limited[0][i, j], limited[1][i, j]) == one
-    # What is returned and stored has numbers of its own.
-    mine = np.array([1.0, 2.0])
-    stored, returned = VelocityLimits(max_v=mine), saturate(mine, mine, VelocityLimits(), R, L)
-    mine[0] = -5.0
-    assert stored.max_v[0] == returned[0][0] == returned[1][0] == 1.0
-
-
-def test_batches_of_any_size_are_within_their_limits_to_the_last_bit():
-    rng = np.random.default_rng(10)
-    drawn = 10.0 ** rng.uniform(-60.0, 60.0, (6, 20_000))
+def test_numbers_of_any_size_are_within_their_limits_to_the_last_bit_alone_and_in_a_batch():
+    rng, count = np.random.default_rng(10), 6_000
+    drawn = 10.0 ** rng.uniform(-60.0, 60.0, (6, count))
     drawn[:, ::7] = np.exp(rng.uniform(-4.0, 4.0, drawn[:, ::7].shape))
-    v, omega = drawn[:2] * rng.choice([-1.0, 1.0], (2, 20_000))
+    v, omega = drawn[:2] * rng.choice([-1.0, 1.0], (2, count))
     r, separation, wheels, body = drawn[2:]
     for body_limits in ({}, {'max_v': body, 'min_omega': -body}):
         limits = VelocityLimits(**body_limits, max_wheel_speed=wheels)
@@ -123,7 +100,7 @@ def test_batches_of_any_size_are_within_their_limits_to_the_last_bit():
         assert np.all(np.max(np.abs(body_to_wheel(*limited, r, separation)), axis=0) <= wheels)
         assert np.all((limits.min_v <= limited[0]) & (limited[0] <= limits.max_v))
         assert np.all((limits.min_omega <= limited[1]) & (limited[1] <= limits.max_omega))
-        for i in range(0, 20_000, 50):
+        for i in range(0, count, 60):
             alone = VelocityLimits(
                 **{name: float(limit[i]) for name, limit in body_limits.items()},
                 max_wheel_speed=float(wheels[i]),
@@ -132,22 +109,15 @@ def test_batches_of_any_size_are_within_their_limits_to_the_last_bit():
             assert one == (limited[0][i], limited[1][i])
 
 
-BAD_LIMITS = {
-    **dict.fromkeys(['min_v', 'min_omega'], ('zero or negative', [1e-300, np.inf])),
-    **dict.fromkeys(['max_v', 'max_omega'], ('zero or positive', [-1e-300, -np.inf])),
-    'max_wheel_speed': ('positive', [0.0, -1.0, -np.inf]),
-}
-
-
-@pytest.mark.parametrize('name', BAD_LIMITS)
-def test_an_invalid_limit_is_named(name):
-    allowed, wrong = BAD_LIMITS[name]
-    for bad in (*wrong, np.nan):
-        with pytest.raises(ValueError, match=rf'^{name} must be {allowed}, got {bad}$'):
-            VelocityLimits(**{name: bad})
-    for bad in ([0.5, -0.5], np.array([0.1, np.nan]), 'fast', None, 1j):
-        with pytest.raises(ValueError, match=rf'^{name} must be'):
-            VelocityLimits(**{name: bad})
+def test_an_invalid_limit_is_named():
+    for name in EVERY_LIMIT:
+        allowed = 'positive' if name == 'max_wheel_speed' else 'zero or '
+        wrong = [1e-300, np.inf] if name.startswith('min') else [-1e-300, -np.inf]
+        for bad in (*wrong, np.nan, [0.5, -0.5]):
+            with pytest.raises(ValueError, match=rf'^{name} must be {allowed}'):
+                VelocityLimits(**{name: bad})
+    with pytest.raises(ValueError, match='max_wheel_speed'):
+        VelocityLimits(max_wheel_speed=0.0)
 
 
 def test_what_does_not_fit_together_is_named():
@@ -156,14 +126,12 @@ def test_what_does_not_fit_together_is_named():
         with pytest.raises(ValueError, match=r'leading axes that broadcast, got .*\(3,\).*\(2,\)'):
             saturate(np.ones(3), 1.0 if names else np.ones(2), limits, R, L)
     limits = VelocityLimits(max_wheel_speed=1.0)
-    for r, separation, name in ((0.0, L, 'r'), (np.nan, L, 'r'), (R, -L, 'L'), (R, np.inf, 'L')):
+    for r, separation, name in ((0.0, L, 'r'), (R, -L, 'L'), (R, np.inf, 'L')):
         with pytest.raises(ValueError, match=rf'^{name} must be positive and finite'):
             saturate(1.0, 1.0, limits, r, separation)
     for fast in (1e308, [-1e308, 0.0]):
-        with pytest.raises(ValueError, match='must give a finite result'):
+        with pytest.raises(ValueError, match='finite'):
             saturate(fast, 1e308, limits, 1.0, 16.0)
-    # The wheels are needed only for their limit.
-    assert saturate(1.0, 2.0, VelocityLimits(max_v=0.5)) == (0.5, 1.0)
     for missing in ((), (R,), (None, L)):
-        with pytest.raises(ValueError, match='limits have a max_wheel_speed, so r and L must be given'):
+        with pytest.raises(ValueError, match='max_wheel_speed, so r and L must be given'):
             saturate(1.0, 2.0, limits, *missing)

@@ -8,8 +8,7 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import LEAN
-from support.ros_messages import goal, odometry
-from support.ros_messages import twist as command
+from support.ros_messages import goal, odometry, twist
 
 TOPICS = {
     Odometry: 'odom',
@@ -65,10 +64,6 @@ class Student(Node):
 
     def on_cancel(self, _, response):
         return response
-
-
-def twist(v, omega=0.0):
-    return command(v, omega)
 
 
 def odometry_at(x, y=0.0, v=0.0, theta=0.0):

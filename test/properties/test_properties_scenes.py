@@ -29,16 +29,13 @@ SQUARE = StaysWithin((0.0, 1.0), (-1.0, 1.0))
 CORNER = [(0, 0), (1, 0), (1, 1)]
 ARRIVES = [goal_at(1.0), 1.0, odometry_at(0.5, v=0.5), 0.5, odometry_at(0.96), 3.0]
 ON_PATH, IN_TIME = StaysOnPath(0.1), StaysOnPath(0.1, within=1.0)
+FROM_AFTER = StaysOnPath(0.1, after=0.25)
 STRAIGHT = path((0, 0), (1, 0))
 
 
 def commands(*twists):
     """Return commands at a period of 0.1 s."""
     return [event for one in twists for event in (twist(*one), 0.1)]
-
-
-def ramp(step, count):
-    return commands(*((step * number,) for number in range(1, count)))
 
 
 def statuses(*sequence):
@@ -75,22 +72,12 @@ KEPT = [
             PoseFinite(),
         )
     ),
-    (StatusProtocol(), statuses(ACCEPTED)),
-    (StatusProtocol(), statuses(ACCEPTED, ACCEPTED, EXECUTING, EXECUTING, ABORTED)),
-    (StatusProtocol(), statuses(ACCEPTED, CANCELED)),
-    (StatusProtocol(), statuses(ABORTED)),
-    (
-        StatusProtocol(),
-        statuses(ACCEPTED, EXECUTING, CANCELED, (ACCEPTED, 2), (EXECUTING, 2), (SUCCEEDED, 2)),
-    ),
+    (StatusProtocol(), statuses(ACCEPTED, ACCEPTED, EXECUTING, EXECUTING, ABORTED, (ABORTED, 2))),
+    (StatusProtocol(), statuses(ACCEPTED, CANCELED, (ACCEPTED, 2), (EXECUTING, 2), (SUCCEEDED, 2))),
     (StatusProtocol(), statuses(ACCEPTED, EXECUTING, (ABORTED, 2), EXECUTING, SUCCEEDED)),
-    (NoStaleGoals(), accepted(1, 2, 3)),
     (NoStaleGoals(), accepted(0, 0, 2, 0, 3)),
     # The distance counts after the first metres.
-    (
-        StaysOnPath(0.1, after=0.25),
-        [STRAIGHT, odometry_at(0.0, 1.0), odometry_at(0.5, 0.1), 0.1],
-    ),
+    (FROM_AFTER, [STRAIGHT, odometry_at(0.0, 1.0), odometry_at(0.5, 0.1), 0.1]),
     # A path that is replaced does not count.
     *(
         (ON_PATH, [STRAIGHT, other, odometry_at(0.0, 9.0), 0.1])
@@ -114,36 +101,17 @@ VIOLATED = [
         )
     ),
     # Twice the limit is found even with much slack.
-    (AccelerationWithin(1.0, 2.0, slack=0.5), ramp(0.2, 6), 'changes of 1 m/s'),
+    (AccelerationWithin(1.0, 2.0, slack=0.5), commands((0.2,), (0.4,), (0.6,), (0.8,), (1.0,)), '1 m/s'),
     # A stop is an acceleration where it is not allowed.
-    (
-        AccelerationWithin(1.0, 2.0, stops=False),
-        commands((0.1,), (0.2,), (0.3,), (0.0,)),
-        'changes of 1 m/s',
-    ),
+    (AccelerationWithin(1.0, 2.0, stops=False), commands((0.1,), (0.2,), (0.3,), (0.0,)), '1 m/s'),
     (ReachesGoal(1.4), ARRIVES, r'1.4 s after .* the robot is 0.5 m from the goal at x 1 m, y 0 m'),
     (ReachesGoal(2.0, tolerance=0.03), ARRIVES, 'allowed: within 0.03 m and standing'),
     (ReachesGoal(1.0), [goal_at(1.0), 1.5], 'there was no odometry on /odom'),
-    (
-        ReachesGoal(1.0),
-        [odometry_at(1.0, v=0.1), goal_at(1.0), 1.5],
-        r'the robot is 0 m .* v 0.1 m/s',
-    ),
-    (
-        ReachesGoal(1.0, yaw_tolerance=0.1),
-        [goal_at(1.0), odometry_at(1.0, theta=3.1), 2.0],
-        'theta 3.1 rad',
-    ),
-    (
-        ReachesGoal(2.0),
-        [goal_at(1.0), odometry_at(0.0), 1.0],
-        r'the run ended 1 s after the goal was published, and the robot is 1 m .* run for 2 s after',
-    ),
-    (
-        Settles(1.0, 0.1),
-        [goal_at(1.0), odometry_at(0.0), 1.1, odometry_at(0.5), 0.1],
-        '0.5 m from the',
-    ),
+    (ReachesGoal(1.0), [odometry_at(1.0, v=0.1), goal_at(1.0), 1.5], r'robot is 0 m .* v 0.1 m/s'),
+    (ReachesGoal(1.0, yaw_tolerance=0.1), [goal_at(1.0), odometry_at(1.0, theta=3.1), 2.0], '3.1 rad'),
+    (ReachesGoal(2.0), [goal_at(1.0), odometry_at(0.0), 1.0], r'the run ended 1 s after .* run for 2 s'),
+    (Settles(1.0, 0.1), [goal_at(1.0), 1.1, odometry_at(0.5), 0.1], '0.5 m from the'),
+    (Settles(1.0, 0.1), [goal_at(1.0), odometry_at(0.5), 1.5], '0.5 m from the'),
     (
         Settles(1.0, 0.1),
         [goal_at(1.0), odometry_at(1.0), 1.5, odometry_at(1.0), 1.0, odometry_at(1.11), 0.1],
@@ -155,31 +123,19 @@ VIOLATED = [
     (StaysNear(CORNER, 0.1), [odometry_at(1.0, 1.2)], r'at most 0.1 m from the path, not 0.2 m'),
     (PoseFinite(), [odometry_at(inf)], 'x inf m'),
     (PoseFinite(), [odometry_at(0.0, v=nan)], 'v nan m/s'),
-    (PoseFinite(), [odometry_at(2e6)], 'allowed: finite values, and a position of at most 1e'),
+    (PoseFinite(), [odometry_at(2e6)], 'a position of at most 1e'),
     (StatusProtocol(), statuses(EXECUTING), r'stamp 1.0+ s .* as its first status; allowed: ACC'),
     (StatusProtocol(), statuses(ACCEPTED, SUCCEEDED), 'after ACCEPTED; allowed: ACCEPTED, EXECUTING, '),
     (StatusProtocol(), statuses(ACCEPTED, EXECUTING, ACCEPTED), 'ACCEPTED of .* after EXECUTING'),
     (StatusProtocol(), statuses(ABORTED, ABORTED), 'ABORTED of .* was ABORTED already; allowed: noth'),
-    (StatusProtocol(), statuses(ABORTED, CANCELED), 'CANCELED of .* was ABORTED already'),
     (StatusProtocol(), statuses(ABORTED, ACCEPTED), 'ACCEPTED of .* was ABORTED already'),
-    (
-        StatusProtocol(),
-        statuses(ACCEPTED, (ACCEPTED, 2)),
-        'while the goal before is ACCEPTED; allowed: after its terminal status',
-    ),
-    (StatusProtocol(), statuses(0), '0 of .* as its first status'),
+    (StatusProtocol(), statuses(ACCEPTED, (ACCEPTED, 2)), 'while the goal before is ACCEPTED'),
     (StatusProtocol(), statuses(17), '17 of .* as its first status'),
     (NoStaleGoals(), accepted(1, 3, 2), r'ACCEPTED of the goal with stamp 2\.0+ s, after one'),
     (NoStaleGoals(), accepted(1, 2, 2), r'ACCEPTED of the goal with stamp 2\.0+ s, after one'),
-    *(
-        (StaysOnPath(0.1, after=0.25), [STRAIGHT, odometry_at(0.0, 1.0), odometry_at(*pose)], 'allowed')
-        for pose in ((0.5, -0.1001), (nan, 0.0))
-    ),
-    (
-        IN_TIME,
-        [odometry_at(0.0), STRAIGHT, odometry_at(0.5), 1.1],
-        '1 s after the path was published the robot is',
-    ),
+    (FROM_AFTER, [STRAIGHT, odometry_at(0.0, 1.0), odometry_at(0.5, -0.1001)], 'allowed'),
+    (FROM_AFTER, [STRAIGHT, odometry_at(nan, 0.0)], 'allowed'),
+    (IN_TIME, [odometry_at(0.0), STRAIGHT, odometry_at(0.5), 1.1], '1 s after the path was published'),
     (IN_TIME, [STRAIGHT, odometry_at(0.2), 0.5], r'the run ended 0.5 s after the path .* 0.2 m along'),
 ]
 

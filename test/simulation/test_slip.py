@@ -12,19 +12,14 @@ import pytest
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.simulation import Robot, RobotModel
-from diffdrive_jacobian.simulation.slip import CELL, HOLD, Drift, _block, normals
+from diffdrive_jacobian.simulation.slip import CELL, Drift, _block, normals
 
 SECOND = 1_000_000_000
-MULTIPLIERS = (
-    'right_wheel_radius_multiplier',
-    'left_wheel_radius_multiplier',
-    'wheel_separation_multiplier',
-)
 
 
-def robot(stamp=0, pose=(0.0, 0.0, 0.0), variance=1e-5, **drift):
+def robot(stamp=0, variance=1e-5, **drift):
     model = RobotModel(wheel_travel_variance=variance, drift=Drift(**drift))
-    return Robot(model=model, stamp=stamp, pose=pose)
+    return Robot(model=model, stamp=stamp, pose=(0.0, 0.0, 0.0))
 
 
 def driven(start, commands, end):
@@ -33,26 +28,12 @@ def driven(start, commands, end):
     return start.at(end)
 
 
-def slips(one, other):
-    """Distances that the wheels slipped between two states on a short path, right and left."""
-    error = other.true_pose - other.pose - (one.true_pose - one.pose)
-    along, turn = error[0], error[2]
-    half = turn * one.model.wheel_separation / 2.0
-    return along + half, along - half
-
-
 def irregular(seed, count, longest=30_000_000):
     """Commands at irregular times: straight, arcs, in place, and stops."""
     generator = np.random.default_rng(seed)
     stamps = np.cumsum(generator.integers(1, longest, count)).tolist()
     twists = [(0.2, 0.0), (0.2, 1.0), (0.0, -2.0), (0.0, 0.0), (-0.1, 0.3), (0.08, 1.0)]
-    return [(twists[index], stamp) for index, stamp in enumerate(stamps) for index in [index % 6]]
-
-
-def pulsed(on, off):
-    """Commands to drive for some nanoseconds and then to stop for some, again and again."""
-    stamps = range(0, SECOND // 2, on + off)
-    return [event for stamp in stamps for event in (((0.2, 0.5), stamp), ((0.0, 0.0), stamp + on))]
+    return [(twists[index % 6], stamp) for index, stamp in enumerate(stamps)]
 
 
 # --- Random numbers
@@ -70,15 +51,10 @@ def test_the_generator_is_philox_with_seed_and_wheel_as_key_and_the_cell_as_coun
             u, w = (int(word) >> 11 for word in words)
             expected = math.sqrt(-2.0 * math.log((u + 1) / 2**53)) * math.cos(math.tau * (w / 2**53))
             assert normals(seed, 0, cell)[wheel] == expected
-
-
-def test_negative_times_and_wide_cells_have_numbers_of_their_own():
-    found = [
-        normals(5, level, cell)
-        for level in (0, 1, 20)
-        for cell in (-257, -256, -255, -1, 0, 1, 255, 256, 257)
-    ]
-    assert len({number for pair in found for number in pair}) == 2 * len(found)
+    # Negative times and wide cells have numbers of their own.
+    cells = (-257, -256, -255, -1, 0, 1, 255, 256, 257)
+    found = [number for level in (0, 1, 20) for cell in cells for number in normals(5, level, cell)]
+    assert len(set(found)) == len(found)
 
 
 # --- The same motion however it is computed
@@ -86,16 +62,15 @@ def test_negative_times_and_wide_cells_have_numbers_of_their_own():
 
 @pytest.mark.parametrize('drift', [{'seed': 3}, {'right_wheel_radius_multiplier': 1.01}], ids=str)
 def test_the_truth_does_not_depend_on_when_it_is_computed(drift):
-    commands = irregular(1, 25)
+    commands = irregular(1, 15)
     end = commands[-1][1] + SECOND
     expected = driven(robot(**drift), commands, end)
     generator = np.random.default_rng(2)
     asked = robot(**drift)
-    events = [*commands, (None, end)]
-    for (twist, stamp), (_, later) in pairwise(events):
+    for (twist, stamp), (_, later) in pairwise([*commands, (None, end)]):
         asked = asked.commanded(twist, stamp)
         # In any order, and again after the numbers were forgotten.
-        for one in generator.integers(stamp, later, 5, endpoint=True).tolist():
+        for one in generator.integers(stamp, later, 3, endpoint=True).tolist():
             asked.at(one)
             _block.cache_clear()
     assert asked.at(end).true_pose_tuple == expected.true_pose_tuple
@@ -104,7 +79,7 @@ def test_the_truth_does_not_depend_on_when_it_is_computed(drift):
 
 
 def test_odometry_is_that_of_a_perfect_robot():
-    commands = irregular(4, 40)
+    commands = irregular(4, 20)
     end = commands[-1][1] + SECOND
     slipping = driven(robot(seed=1, wheel_separation_multiplier=1.1), commands, end)
     perfect = driven(Robot(model=RobotModel(), stamp=0, pose=[0, 0, 0]), commands, end)
@@ -126,8 +101,7 @@ def test_a_robot_at_rest_does_not_slip_after_the_cell_in_which_it_stopped():
 
 def test_a_wheel_at_rest_does_not_slip():
     """The left one, about which the robot turns, also if it is inexact by the rounding of the twist."""
-    start = robot(seed=1)
-    turned = driven(start, [((0.16, 2.0), 0)], SECOND // 10)
+    turned = driven(robot(seed=1), [((0.16, 2.0), 0)], SECOND // 10)
     _, _, theta = turned.true_pose_tuple
     x, y = 0.08 * math.sin(theta), 0.08 - 0.08 * math.cos(theta)
     assert turned.true_pose[:2] == pytest.approx([x, y], abs=1e-12)
@@ -146,55 +120,34 @@ def test_a_timeout_stops_the_truth_as_well():
 # --- What the noise is
 
 
-def test_in_a_cell_the_robot_moves_along_one_arc_with_its_numbers():
-    start = driven(robot(variance=1e-4, seed=9), [((0.2, 0.5), 0)], 10 * CELL)
-    (r, left), L, k = normals(9, 0, 10), 0.16, 1e-4
-    rims = [0.2 + 0.5 * L / 2.0, 0.2 - 0.5 * L / 2.0]
-    gains = [math.sqrt(k * rim / (CELL * 1e-9)) for rim in rims]
-    true = [rim + gain * xi for rim, gain, xi in zip(rims, gains, (r, left), strict=True)]
-    twist = (true[0] + true[1]) / 2.0, (true[0] - true[1]) / L
-    assert start.true_twist == pytest.approx(twist, rel=1e-12)
-    for part in (0.25, 0.5, 1.0):
-        end = start.at(10 * CELL + round(part * CELL))
-        expected = se2.integrate(start.true_pose, twist, part * CELL * 1e-9)
-        np.testing.assert_allclose(end.true_pose, expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    'speeds',
-    [(0.1, 0.3, 0.3, -0.05, 0.9), (0.3, 0.0, 0.3, 0.0, 0.3), (0.0, 0.0, 0.3, 0.0, 0.0), (0.0,) * 5],
-    ids=str,
-)
-def test_the_slip_in_a_cell_has_the_variance_of_its_distance_whatever_the_commands(speeds):
+def test_the_slip_in_a_cell_has_the_variance_of_its_distance_whatever_the_commands():
     """Divided by xi, the slip of the whole cell is the square root of k |ds|."""
     k, cell, offsets = 1e-5, 50, (0, 3_000_000, 3_000_001, 11_000_000, 19_000_000)
     begin, end = cell * CELL, (cell + 1) * CELL
-    start = robot(begin, seed=4)
-    commands = [((v, 0.0), begin + offset) for v, offset in zip(speeds, offsets, strict=True)]
-    durations = np.diff([*offsets, CELL]) * 1e-9
-    distance = float(np.abs(speeds) @ durations)
-    slipped = slips(start, driven(start, commands, end))
-    for distance_slipped, xi in zip(slipped, normals(4, 0, cell), strict=True):
+    start, durations = robot(begin, seed=4), np.diff([*offsets, CELL]) * 1e-9
+    for speeds in (
+        (0.1, 0.3, 0.3, -0.05, 0.9),
+        (0.3, 0.0, 0.3, 0.0, 0.3),
+        (0.0, 0.0, 0.3, 0.0, 0.0),
+        (0.0,) * 5,
+    ):
+        commands = [((v, 0.0), begin + offset) for v, offset in zip(speeds, offsets, strict=True)]
+        state = driven(start, commands, end)
         # The path is so short that the slip adds up along x.
-        assert distance_slipped / xi == pytest.approx(math.sqrt(k * distance), rel=1e-4)
+        along, _, turn = state.true_pose - state.pose
+        half = turn * state.model.wheel_separation / 2.0
+        expected = math.sqrt(k * float(np.abs(speeds) @ durations))
+        for slipped, xi in zip((along + half, along - half), normals(4, 0, cell), strict=True):
+            assert slipped / xi == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize('share', [1e-4, 0.1, 0.5, 0.9, 0.9999])
-def test_wheels_that_stopped_slip_slower_than_while_they_rolled(share):
-    begin = 50 * CELL
-    driving = robot(begin, seed=4).commanded((0.5, 0.0), begin)
-    stopped = driving.commanded((0.0, 0.0), begin + round(share * CELL))
-    rolling, resting = (np.array(one.true_twist) - one.twist for one in (driving, stopped))
-    assert np.all(np.abs(resting) < np.abs(rolling))
-
-
-@pytest.mark.parametrize('hold', [HOLD, SECOND // 2], ids='wide cells after {} ns'.format)
-def test_the_same_command_again_changes_nothing_but_rounding(monkeypatch, hold):
-    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.HOLD', hold)
+def test_the_same_command_again_changes_nothing_but_rounding(monkeypatch):
+    """Also in the wide cells of a command that is held for long."""
+    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.HOLD', SECOND // 2)
     begin = 123_456_789
-    once = driven(robot(seed=8), [((0.2, 0.4), begin)], 5 * SECOND)
-    often = [((0.2, 0.4), stamp) for stamp in range(begin, 5 * SECOND, 7_777_777)]
-    repeated = driven(robot(seed=8), often, 5 * SECOND)
+    once = driven(robot(seed=8), [((0.2, 0.4), begin)], 3 * SECOND)
+    often = [((0.2, 0.4), stamp) for stamp in range(begin, 3 * SECOND, 17_777_777)]
+    repeated = driven(robot(seed=8), often, 3 * SECOND)
     np.testing.assert_allclose(repeated.true_pose, once.true_pose, rtol=0.0, atol=1e-13)
 
 
@@ -203,8 +156,9 @@ def test_the_true_pose_is_the_integral_of_the_true_twist(monkeypatch):
     monkeypatch.setattr('diffdrive_jacobian.simulation.slip.HOLD', SECOND)
     start = robot(seed=6, variance=1e-3, left_wheel_radius_multiplier=0.97)
     held = start.commanded((0.2, 0.3), 5)
-    states = [held.at(stamp) for stamp in np.geomspace(10, 50 * SECOND, 20).astype(int).tolist()]
-    states += [driven(start, irregular(7, count), irregular(7, count)[-1][1]) for count in range(1, 20)]
+    states = [held.at(stamp) for stamp in np.geomspace(10, 50 * SECOND, 12).astype(int).tolist()]
+    commands = irregular(7, 20)
+    states += [driven(start, commands[:count], commands[count - 1][1]) for count in range(1, 20)]
     for state in states:
         end = state.at(state.stamp + 1)
         turned = math.remainder(end.true_pose[2] - state.true_pose[2], math.tau)
@@ -215,23 +169,15 @@ def test_the_true_pose_is_the_integral_of_the_true_twist(monkeypatch):
         assert turned == pytest.approx(omega * 1e-9, abs=2e-14)
 
 
-@pytest.mark.parametrize('commands', ['arc', 'in place', 'irregular', 'short starts', 'short stops'])
-def test_nees_against_the_odometry_is_three(commands):
-    """Of 100 seeds. The standard error of the mean is sqrt(6 / 100)."""
-    drives = {
-        'arc': [((0.22, 0.5), 7_654_321)],
-        'in place': [((0.0, 1.0), 7_654_321)],
-        'irregular': irregular(5, 40),
-        'short starts': pulsed(2_000_000, 18_000_000),
-        'short stops': pulsed(14_000_000, 1_000_000),
-    }
+def test_nees_against_the_odometry_is_three():
+    """Of 60 seeds. The standard error of the mean is sqrt(6 / 60)."""
     values = []
-    for seed in range(100):
-        state = driven(robot(seed=seed), drives[commands], SECOND)
+    for seed in range(60):
+        state = driven(robot(seed=seed), irregular(5, 25), SECOND)
         error = state.true_pose - state.pose
         error[2] = math.remainder(error[2], math.tau)
         values.append(error @ np.linalg.solve(state.covariance, error))
-    assert np.mean(values) == pytest.approx(3.0, abs=0.75)
+    assert np.mean(values) == pytest.approx(3.0, abs=1.0)
 
 
 # --- Wheels that are not as nominal
@@ -239,14 +185,16 @@ def test_nees_against_the_odometry_is_three(commands):
 
 def test_wheels_of_other_radii_and_separation_move_as_the_jacobian_says():
     right, left, separation = 1.02, 0.99, 1.05
-    multipliers = dict(zip(MULTIPLIERS, (right, left, separation), strict=True))
-    start = robot(**multipliers)
+    start = robot(
+        right_wheel_radius_multiplier=right,
+        left_wheel_radius_multiplier=left,
+        wheel_separation_multiplier=separation,
+    )
     state = driven(start, [((0.2, 0.3), 0)], 4 * SECOND)
     omega_R, omega_L = state.wheel_speeds
-    model = state.model
     # Wheels of one radius, turning as much faster as their radius is larger.
-    speeds = right * omega_R, left * omega_L
-    twist = wheel_to_body(*speeds, model.wheel_radius, separation * model.wheel_separation)
+    wheels = state.model.wheel_radius, separation * state.model.wheel_separation
+    twist = wheel_to_body(right * omega_R, left * omega_L, *wheels)
     assert state.true_twist == pytest.approx(twist, rel=1e-14)
     np.testing.assert_allclose(state.true_pose, se2.integrate([0, 0, 0], twist, 4.0), rtol=1e-13)
 
@@ -280,35 +228,32 @@ def test_the_robot_stays_where_it_is_when_time_goes_back_or_its_drift_changes():
 
 
 def test_a_command_that_is_held_for_long_takes_few_steps(monkeypatch):
-    """Ten minutes in cells of the usual width, then half as many for each doubling of the time."""
-    steps = 0
-
-    def counted(seed, level, cell):
-        nonlocal steps
-        steps += 1
-        return 0.1, -0.1
-
-    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.normals', counted)
+    """For a time in cells of the usual width, then half as many for each doubling of the time."""
+    hold, steps = 10 * SECOND, []
+    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.HOLD', hold)
+    monkeypatch.setattr(
+        'diffdrive_jacobian.simulation.slip.normals', lambda *cell: steps.append(cell) or (0.1, -0.1)
+    )
     commanded = robot(seed=1).commanded((0.2, 0.1), 5)
-    commanded.at(HOLD)
-    assert steps == HOLD // CELL + 1
-    commanded.at(16 * HOLD)
-    assert steps == pytest.approx(3 * HOLD // CELL, rel=0.01)
-    before = steps
-    commanded.at(16 * HOLD + CELL)
-    assert steps == before + 1
+    commanded.at(hold)
+    assert len(steps) == hold // CELL + 1
+    commanded.at(16 * hold)
+    assert len(steps) == pytest.approx(3 * hold // CELL, rel=0.02)
+    before = len(steps)
+    commanded.at(16 * hold + CELL)
+    assert len(steps) == before + 1
 
 
 def test_wide_cells_have_the_same_variance(monkeypatch):
     """The turn of a robot that drives straight has the variance 2 k |ds| / L^2."""
-    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.HOLD', SECOND)
-    start, end = 32 * SECOND, 64 * SECOND
+    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.HOLD', SECOND // 4)
+    start, end = 8 * SECOND, 16 * SECOND
     ratios = []
     for seed in range(60):
         commanded = robot(seed=seed).commanded((0.1, 0.0), 0)
         one, other = (commanded.at(stamp) for stamp in (start, end))
         turn = math.remainder(other.true_pose[2] - one.true_pose[2], math.tau)
-        ratios.append(turn * turn / (2.0 * 1e-5 * 0.1 * 32.0 / 0.16**2))
+        ratios.append(turn * turn / (2.0 * 1e-5 * 0.1 * 8.0 / 0.16**2))
     # Its standard error is sqrt(2 / 60).
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.7)
 
@@ -316,12 +261,9 @@ def test_wide_cells_have_the_same_variance(monkeypatch):
 # --- Bad input
 
 
-def test_a_motion_that_overflows_is_refused():
+def test_a_seed_out_of_range_and_a_motion_that_overflows_are_refused():
+    for seed in (1.5, '1', -1, 2**63, True):
+        with pytest.raises(ValueError, match=r'^seed must be an integer from 0 to 9223372036854775807'):
+            Drift(seed=seed)
     with pytest.raises(ValueError, match='overflow'):
         driven(robot(right_wheel_radius_multiplier=1e200), [((1e200, 0.0), 0)], SECOND)
-
-
-@pytest.mark.parametrize('seed', [1.5, '1', -1, 2**63, True, [1]], ids=str)
-def test_a_seed_that_is_no_integer_or_out_of_range_is_refused(seed):
-    with pytest.raises(ValueError, match=r'^seed must be an integer from 0 to 9223372036854775807'):
-        Drift(seed=seed)

@@ -23,7 +23,7 @@ def stamp(nanoseconds):
     return Time(sec=sec, nanosec=nanosec)
 
 
-def twist(v, omega):
+def twist(v, omega=0.0):
     message = Twist()
     message.linear.x, message.angular.z = float(v), float(omega)
     return message
