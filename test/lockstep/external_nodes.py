@@ -251,62 +251,26 @@ class Waiting(Echo):
         super().on_number(number)
 
 
-class Changing(Echo):
-    """Creates something, and destroys it at the next number."""
-
-    created = None
+class Creating(Echo):
+    """Creates at a number what cannot take part, and destroys some of it at 0."""
 
     def on_number(self, number):
         super().on_number(number)
-        if self.created is None:
-            self.created = self.create()
+        name, which = self.get_name(), number.data
+        if which == 0.0:
+            self.destroy_subscription(self.created) or self.destroy_publisher(self.created)
+        elif which == 1.0:
+            self.created = self.create_subscription(Float64, f'{name}/in', print, 10)
+        elif which == 2.0:
+            self.created = self.create_publisher(String, f'{name}/text', 10)
+        elif which == 3.0:
+            self.created = Node(name, start_parameter_services=False)
+        elif which == 4.0:
+            self.created = Node('spy')
+            self.created.create_subscription(Float64, f'{name}/in', print, 10)
         else:
-            self.destroy(self.created)
-            self.created = None
-
-
-class Twice(Changing):
-    """Hears one topic twice."""
-
-    def create(self):
-        return self.create_subscription(Float64, f'{self.get_name()}/in', print, 10)
-
-    def destroy(self, subscription):
-        self.destroy_subscription(subscription)
-
-
-class Retyped(Changing):
-    """Publishes another type."""
-
-    def create(self):
-        return self.create_publisher(String, f'{self.get_name()}/text', 10)
-
-    def destroy(self, publisher):
-        self.destroy_publisher(publisher)
-
-
-class Twin(Echo):
-    """Creates a node of the same name."""
-
-    def on_number(self, number):
-        self.twin = Node('twin', start_parameter_services=False)
-
-
-class Requalified(Echo):
-    """Publishes with another quality of service after the first number."""
-
-    def on_number(self, number):
-        super().on_number(number)
-        self.destroy_publisher(self.out)
-        self.out = self.create_publisher(Header, f'{self.get_name()}/out', qos_profile_sensor_data)
-
-
-class Spied(Echo):
-    """Creates a node that hears the same topic."""
-
-    def on_number(self, number):
-        self.spy = Node('spy')
-        self.spy.create_subscription(Float64, 'spied/in', print, 10)
+            self.destroy_publisher(self.out)
+            self.out = self.create_publisher(Header, f'{name}/out', qos_profile_sensor_data)
 
 
 class WallTimer(Echo):
@@ -363,32 +327,14 @@ class Mortal(Echo):
         os._exit(int(number.data))
 
 
+CLASSES = [one for one in list(globals().values()) if isinstance(one, type) and issubclass(one, Node)]
 NODES = {
-    'echo': Echo,
+    **{one.__name__.lower(): one for one in CLASSES},
     'bare': lambda name: Echo(name, start_parameter_services=False),
     'untimed': lambda name: Echo(name, parameter_overrides=[Parameter('use_sim_time', value=False)]),
     'best_effort': lambda name: Repeater(name, qos_profile_sensor_data),
     **dict.fromkeys(('a', 'b', 'c'), Stage),
-    **dict.fromkeys(('shared', 'other'), Shared),
-    **{
-        kind.__name__.lower(): kind
-        for kind in (
-            *(Ticker, Growing, Late, Hearing, Sharing, Repeater, Caller, Asking, AskingFirst, Counting),
-            *(
-                Mortal,
-                Waiting,
-                Twice,
-                Twin,
-                Retyped,
-                Requalified,
-                Spied,
-                WallTimer,
-                Threaded,
-                Busy,
-                Napping,
-            ),
-        )
-    },
+    'other': Shared,
 }
 
 

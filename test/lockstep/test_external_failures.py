@@ -32,7 +32,7 @@ def fails(match):
 
 @pytest.fixture(scope='class')
 def process():
-    nodes = command('echo', 'repeater', 'asking', 'twice', 'retyped')
+    nodes = command('echo', 'repeater', 'asking', 'creating')
     with Lockstep() as world:
         process = world.start(
             [*nodes, '--ros-args', '-p', 'times:=1000'], patience=0.5, clock_period=1.0
@@ -50,21 +50,19 @@ class TestWhileItRuns:
     """One process. Each test leaves it as it was, but for the last one."""
 
     @pytest.mark.parametrize(
-        ('name', 'words'),
+        ('number', 'words'),
         [
-            ('twice', '/twice has 2 subscriptions to /twice/in: which of them'),
-            ('retyped', r'type std_msgs/msg/String of /retyped/text of /retyped cannot be imported'),
+            (1.0, '/creating has 2 subscriptions to /creating/in: which of them'),
+            (2.0, r'type std_msgs/msg/String of /creating/text of /creating cannot be imported'),
         ],
     )
-    def test_what_is_created_for_a_while_and_cannot_take_part_is_named(
-        self, world, monkeypatch, name, words
-    ):
+    def test_what_cannot_take_part_for_a_while_is_named(self, world, monkeypatch, number, words):
         with monkeypatch.context() as patched:
             patched.delattr('std_msgs.msg.String')
             with fails(words):
-                send(world, name, 0.0)
+                send(world, 'creating', number)
                 world.run_for(10.0)
-        send(world, name, 1.0)
+        send(world, 'creating', 0.0)
         world.run_for(1.0)
 
     def test_a_node_that_stops_to_follow_simulated_time_is_named(self, world):
@@ -102,17 +100,17 @@ def test_a_process_that_is_never_quiet_or_stopped_is_named_with_its_thread(locks
 
 
 @pytest.mark.parametrize(
-    ('name', 'words'),
+    ('number', 'words'),
     [
-        ('twin', 'several nodes of .* have the name /twin'),
-        ('requalified', '/requalified/out with several qualities.*BEST_EFFORT'),
-        ('spied', r'several nodes of .* share /spied/in, which cannot be'),
+        (3.0, 'several nodes of .* have the name /creating'),
+        (4.0, r'several nodes of .* share /creating/in, which cannot be'),
+        (5.0, '/creating/out with several qualities.*BEST_EFFORT'),
     ],
 )
-def test_what_is_created_later_and_cannot_take_part_is_named(lockstep, name, words):
-    lockstep.start(command(name))
+def test_what_is_created_later_and_cannot_take_part_is_named(lockstep, number, words):
+    lockstep.start(command('creating'))
     with fails(words):
-        send(lockstep, name, 0.0)
+        send(lockstep, 'creating', number)
         lockstep.run_for(10.0)
 
 
