@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from forked_nodes import started_in_forks
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from std_msgs.msg import Float64, String
@@ -21,6 +22,13 @@ from diffdrive_jacobian.lockstep.external import process as external_process
 from diffdrive_jacobian.lockstep.external import quiet as quietness
 from diffdrive_jacobian.lockstep.external.process import ExternalProcess
 from diffdrive_jacobian.testing import Lockstep, LockstepError
+
+
+@pytest.fixture(autouse=True, scope='module')
+def forks():
+    """Nodes of `external_nodes` run in forks. Other programs are started as usual."""
+    with started_in_forks():
+        yield
 
 
 def fails(match):
@@ -92,10 +100,10 @@ class TestWhileItRuns:
 
 def test_a_process_that_is_never_quiet_or_stopped_is_named_with_its_thread(lockstep):
     process = lockstep.start(command('busy', 'echo'), patience=0.1)
-    with fails(r"/busy, /echo not quiet within 0.1 s: thread \d+ \('\w+'\) of .* is running"):
+    with fails(r"(?s)/busy, /echo not quiet within 0.1 s: thread \d+ \('\w+'\) of .* is running"):
         send(lockstep, 'busy', 0.0)
     process.signal(signal.SIGSTOP)
-    with fails('/echo not quiet within 0.1 s: thread .* is stopped'):
+    with fails('(?s)/echo not quiet within 0.1 s: thread .* is stopped'):
         send(lockstep, 'echo', 0.0)
 
 
@@ -166,7 +174,7 @@ def test_a_process_that_ends_while_driving_is_quoted(lockstep):
         (
             command('napping'),
             {'patience': 0.5},
-            r'not quiet .*: thread .* (sleeps|is running)',
+            r'(?s)not quiet .*: thread .* (sleeps|is running)',
         ),
         (
             command('echo', 'elsewhere'),
