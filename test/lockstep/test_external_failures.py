@@ -42,9 +42,7 @@ def fails(match):
 def process():
     nodes = command('echo', 'repeater', 'asking', 'creating')
     with Lockstep() as world:
-        process = world.start(
-            [*nodes, '--ros-args', '-p', 'times:=1000'], patience=0.5, clock_period=1.0
-        )
+        process = world.start([*nodes, '--ros-args', '-p', 'times:=1000'], clock_period=1.0)
         process.world = world
         yield process
 
@@ -99,11 +97,11 @@ class TestWhileItRuns:
 
 
 def test_a_process_that_is_never_quiet_or_stopped_is_named_with_its_thread(lockstep):
-    process = lockstep.start(command('busy', 'echo'), patience=0.1)
-    with fails(r"(?s)/busy, /echo not quiet within 0.1 s: thread \d+ \('\w+'\) of .* is running"):
+    process = lockstep.start(command('busy', 'echo'), patience=0.5)
+    with fails(r"(?s)/busy, /echo not quiet within 0.5 s: thread \d+ \('\w+'\) of .* is running"):
         send(lockstep, 'busy', 0.0)
     process.signal(signal.SIGSTOP)
-    with fails('(?s)/echo not quiet within 0.1 s: thread .* is stopped'):
+    with fails('(?s)/echo not quiet within 0.5 s: thread .* is stopped'):
         send(lockstep, 'echo', 0.0)
 
 

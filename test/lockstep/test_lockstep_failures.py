@@ -27,7 +27,7 @@ from diffdrive_jacobian.testing import Lockstep, LockstepError
 def impatient():
     # The first message to a log looks for the files of all modules, which may take longer.
     get_logger('test').debug('')
-    with Lockstep(patience=0.2) as world:
+    with Lockstep(patience=0.5) as world:
         yield world
 
 
@@ -98,7 +98,7 @@ def test_a_callback_that_blocks_is_named(impatient, wait):
         impatient.add(Blocking(wait))
     first = str(caught.value).splitlines()[0]
     assert first.startswith('at 1 s: Blocking.on_tick (timer of 0.1 s, node /blocking, ')
-    assert 'has not returned for 0.2 s of wall time; it is at ' in first
+    assert 'has not returned for 0.5 s of wall time; it is at ' in first
     assert 'innocent' not in first
 
 
