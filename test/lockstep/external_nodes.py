@@ -239,15 +239,15 @@ class Counting(Node):
 
 
 class Waiting(Echo):
-    """Sleeps in its callback, waits for what nobody sends, or starts a process."""
+    """Sleeps in its callback at 0, starts a process at 2, or waits for what nobody sends."""
 
     def on_number(self, number):
         if number.data == 0.0:
             time.sleep(0.004)
-        elif number.data == 1.0:
-            threading.Event().wait(0.05)
-        else:
+        elif number.data == 2.0:
             subprocess.run(['sh', '-c', 'sleep 0.003'], check=True)
+        else:
+            threading.Event().wait(0.05)
         super().on_number(number)
 
 

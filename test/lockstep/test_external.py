@@ -401,21 +401,22 @@ def test_processes_that_talk_to_one_another_do_the_same_as_nodes_of_one():
 
 
 def test_several_threads_and_executors_do_the_same_each_time():
+    names = ('ticker', 'waiting', 'echo')
+
     def run(world):
-        world.start(command('ticker', 'echo', 'threads'))
-        publishers = [
-            world.node.create_publisher(Float64, f'{name}/in', 10) for name in ('echo', 'ticker')
-        ]
-        world.listen(Header, 'echo/out')
-        world.listen(Header, 'ticker/out')
+        world.start(command(*names, 'threads'))
+        publishers = []
+        for name in names:
+            publishers.append(world.node.create_publisher(Float64, f'{name}/in', 10))
+            world.listen(Header, f'{name}/out')
 
         def tick():
             for publisher in publishers:
-                publisher.publish(Float64(data=world.elapsed))
+                publisher.publish(Float64(data=1.0 + len(names) * world.elapsed))
 
         world.node.create_timer(0.02, tick)
-        world.run_for(0.3)
-        assert 'echo/out: 15 from /echo' in world.report()
+        world.run_for(0.2)
+        assert 'echo/out: 10 from /echo' in world.report()
 
     check_repeats(run)
 
