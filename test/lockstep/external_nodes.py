@@ -1,6 +1,7 @@
 """Nodes for a process of their own: `python external_nodes.py NAME ...` spins those nodes.
 
-They use nothing of the package.
+They use nothing of the package. Each receives numbers on NAME/in. What they publish on NAME/out has a
+number, as text, and the time of the node.
 """
 
 import importlib
@@ -12,189 +13,134 @@ import threading
 import time
 
 import rclpy
-from geometry_msgs.msg import Point, TwistStamped
-from nav_msgs.msg import Odometry
-from rclpy.action import ActionServer
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
-from std_msgs.msg import Float64, String
+from std_msgs.msg import Float64, Header, String
 from std_srvs.srv import Trigger
 
 PERIOD = 0.05
 """Period of the ticker (s)."""
-LAST = 3
-"""Number of the message at which the mortal nodes end."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+stopped = threading.Event()
+"""Set by SIGINT."""
 
 
-class Controller(Node):
-    """Answers each odometry by commands with its x and the time of this node."""
+class Echo(Node):
+    """Answers each number by the same number."""
 
-    def __init__(self, name, *, answers=1, **kwargs):
+    def __init__(self, name, **kwargs):
         super().__init__(name, **kwargs)
-        self.answers = answers
-        self.received = 0
-        self.commands = self.create_publisher(TwistStamped, f'{name}/cmd_vel', 10)
-        self.create_subscription(Odometry, f'{name}/odom', self.on_odometry, 10)
+        self.out = self.create_publisher(Header, f'{name}/out', 10)
+        self.create_subscription(Float64, f'{name}/in', self.on_number, 10)
 
-    def on_odometry(self, odometry):
-        self.received += 1
-        for _ in range(self.answers):
-            self.send(odometry.pose.pose.position.x)
+    def on_number(self, number):
+        self.send(number.data)
 
-    def send(self, x):
-        command = TwistStamped()
-        command.header.stamp = self.get_clock().now().to_msg()
-        command.twist.linear.x = x
-        self.commands.publish(command)
+    def send(self, number):
+        self.out.publish(Header(stamp=self.get_clock().now().to_msg(), frame_id=f'{number:g}'))
 
 
-class Ticker(Controller):
-    """Publishes in a timer, whatever it receives."""
+class Ticker(Echo):
+    """Publishes in a timer how many messages it has received."""
 
     def __init__(self, name):
-        super().__init__(name, answers=0)
+        super().__init__(name)
+        self.received = 0
         self.declare_parameter('gain', 2.0)
-        self.create_timer(PERIOD, lambda: self.send(float(self.received)))
+        self.create_timer(PERIOD, lambda: self.send(self.received))
         self.create_service(Trigger, f'{name}/reset', self.on_reset)
         self.create_publisher(String, f'{name}/description', LATCHED).publish(String(data='first'))
-        self.create_subscription(String, f'{name}/map', self.on_map, LATCHED)
+        self.create_subscription(String, f'{name}/map', self.on_number, LATCHED)
+
+    def on_number(self, number):
+        self.received += 1
 
     def on_reset(self, _, response):
         self.received = 0
         response.success = True
         return response
 
-    def on_map(self, message):
-        self.received += len(message.data)
+
+class Growing(Echo):
+    """Creates another node at its first number."""
+
+    child = None
+
+    def on_number(self, number):
+        if self.child is None:
+            self.child = Ticker('child')
+            self.executor.add_node(self.child)
+
+
+class Late(Echo):
+    """Creates its publisher when it receives the first number."""
+
+    def __init__(self, name):
+        super().__init__(name)
+        self.destroy_publisher(self.out)
+        self.out = None
+
+    def on_number(self, number):
+        if self.out is not None:
+            super().on_number(number)
+        else:
+            self.out = self.create_publisher(Header, f'{self.get_name()}/late', 10)
 
 
 class Stage(Node):
-    """One of three that talk to one another: a answers odometry, b has a timer, c combines both."""
+    """One of three that talk to one another: a answers the input, b has a timer, c combines both."""
 
     def __init__(self, name):
         super().__init__(name)
         self.state = 0.0
-        if name == 'a':
-            out = self.create_publisher(Point, 'intent', 10)
-            self.create_subscription(
-                Odometry, 'odom', lambda m: out.publish(Point(x=1.0 - m.pose.pose.position.x)), 10
-            )
+        topics = {'a': 'intent', 'b': 'bias', 'c': 'combined'}
+        self.out = self.create_publisher(Float64, topics[name], 10)
+        if name == 'c':
+            self.create_subscription(Float64, 'bias', self.on_bias, 10)
+            self.create_subscription(Float64, 'intent', self.on_intent, 10)
         elif name == 'b':
-            out = self.create_publisher(Point, 'bias', 10)
-
-            def tick(_=None):
-                self.state += 1.0
-                out.publish(Point(x=self.state % 7.0))
-
-            self.create_timer(0.02, tick)
-            self.create_subscription(Odometry, 'odom', tick, 10)
+            self.create_subscription(Float64, 'input', self.tick, 10)
+            self.create_timer(0.02, self.tick)
         else:
-            out = self.create_publisher(Float64, 'combined', 10)
+            self.create_subscription(Float64, 'input', self.on_input, 10)
 
-            def bias(m):
-                self.state = 0.7 * self.state + 0.3 * m.x
+    def on_input(self, message):
+        self.out.publish(Float64(data=1.0 - message.data))
 
-            def intent(m):
-                out.publish(Float64(data=m.x * (1.0 + 0.2 * self.state)))
-                self.state *= 0.9
+    def tick(self, _=None):
+        self.state += 1.0
+        self.out.publish(Float64(data=self.state % 7.0))
 
-            self.create_subscription(Point, 'bias', bias, 10)
-            self.create_subscription(Point, 'intent', intent, 10)
+    def on_bias(self, message):
+        self.state = 0.7 * self.state + 0.3 * message.data
+
+    def on_intent(self, message):
+        self.out.publish(Float64(data=message.data * (1.0 + 0.2 * self.state)))
+        self.state *= 0.9
 
 
-class Hearing(Controller):
-    """Hears its own commands, as a node that looks after the commands of others does."""
+class Hearing(Echo):
+    """Hears what it publishes itself, as a node that looks after the commands of others does."""
 
     def __init__(self, name):
         super().__init__(name)
-        self.heard = []
+        self.sum = 0.0
         self.sums = self.create_publisher(Float64, f'{name}/sum', 10)
-        self.create_subscription(TwistStamped, f'{name}/cmd_vel', self.on_command, 10)
+        self.create_subscription(Header, f'{name}/out', self.on_out, 10)
 
-    def on_command(self, command):
-        self.heard.append(command.twist.linear.x)
-        self.sums.publish(Float64(data=sum(self.heard)))
-
-
-class Caller(Controller):
-    """Calls a service of the world for each odometry, and publishes when it has responded."""
-
-    def __init__(self, name):
-        super().__init__(name, answers=0)
-        self.client = self.create_client(Trigger, f'{name}/ask')
-
-    def on_odometry(self, odometry):
-        future = self.client.call_async(Trigger.Request())
-        future.add_done_callback(lambda done: self.send(float(done.result().message)))
+    def on_out(self, message):
+        self.sum += float(message.frame_id)
+        self.sums.publish(Float64(data=self.sum))
 
 
-class Late(Controller):
-    """Creates its publisher when it receives the first odometry."""
-
-    def __init__(self, name):
-        super().__init__(name)
-        self.destroy_publisher(self.commands)
-
-    def on_odometry(self, odometry):
-        if not self.received:
-            self.commands = self.create_publisher(TwistStamped, f'{self.get_name()}/late', 10)
-            self.received = 1
-        else:
-            super().on_odometry(odometry)
-
-
-class Counting(Node):
-    """Has an action, and publishes its feedback."""
-
-    def __init__(self, name):
-        super().__init__(name)
-        self.action = importlib.import_module('test_msgs.action').Fibonacci
-        self.server = ActionServer(self, self.action, f'{name}/count', self.execute)
-
-    def execute(self, goal):
-        feedback = self.action.Feedback(sequence=[0, 1])
-        while len(feedback.sequence) < goal.request.order:
-            feedback.sequence.append(feedback.sequence[-1] + feedback.sequence[-2])
-            goal.publish_feedback(feedback)
-        goal.succeed()
-        return self.action.Result(sequence=feedback.sequence)
-
-
-class Repeater(Node):
-    """Publishes what it receives, as often as its parameter says."""
-
-    def __init__(self, name, profile=10):
-        super().__init__(name)
-        self.declare_parameter('times', 1)
-        self.out = self.create_publisher(String, f'{name}/out', profile)
-        self.create_subscription(String, f'{name}/in', self.repeat, profile)
-
-    def repeat(self, message):
-        for _ in range(self.get_parameter('times').value):
-            self.out.publish(message)
-
-
-# --- Attacks
-
-
-class Changing(Repeater):
-    """Publishes with another quality of service after the first message."""
-
-    def repeat(self, message):
-        super().repeat(message)
-        self.destroy_publisher(self.out)
-        self.out = self.create_publisher(String, f'{self.get_name()}/out', qos_profile_sensor_data)
-
-
-class Shared(Controller):
+class Shared(Echo):
     """Numbers what it hears on topics that other nodes of its process have, too."""
 
     def __init__(self, name):
-        super().__init__(name, answers=0)
+        super().__init__(name)
         self.heard = 0
         self.sums = self.create_publisher(String, 'heard', 10)
         self.create_subscription(String, 'words', self.on_word, 10)
@@ -211,19 +157,40 @@ class Sharing(Shared):
         super().__init__(name)
         self.words = self.create_publisher(String, 'words', 10)
 
-    def on_odometry(self, odometry):
-        self.words.publish(String(data=f'{odometry.pose.pose.position.x:g}'))
+    def on_number(self, number):
+        self.words.publish(String(data=f'{number.data:g}'))
 
 
-class Twice(Controller):
-    """Hears one topic twice."""
+class Repeater(Node):
+    """Publishes what it receives, as often as its parameter says."""
+
+    def __init__(self, name, profile=10):
+        super().__init__(name)
+        self.declare_parameter('times', 1)
+        self.out = self.create_publisher(String, f'{name}/out', profile)
+        self.create_subscription(String, f'{name}/in', self.repeat, profile)
+
+    def repeat(self, message):
+        for _ in range(self.get_parameter('times').value):
+            self.out.publish(message)
+
+
+# --- Services and actions
+
+
+class Caller(Echo):
+    """Calls a service of the world for each number, and publishes when it has responded."""
 
     def __init__(self, name):
         super().__init__(name)
-        self.create_subscription(Odometry, f'{name}/odom', self.on_odometry, 10)
+        self.client = self.create_client(Trigger, f'{name}/ask')
+
+    def on_number(self, number):
+        future = self.client.call_async(Trigger.Request())
+        future.add_done_callback(lambda done: self.send(float(done.result().message)))
 
 
-class Asking(Controller):
+class Asking(Echo):
     """Waits in its callbacks for the responses of a service, with a timeout."""
 
     def __init__(self, name):
@@ -231,13 +198,13 @@ class Asking(Controller):
         self.helper = Node(f'{name}_helper', start_parameter_services=False)
         self.client = self.helper.create_client(Trigger, f'{name}/ask')
 
-    def on_odometry(self, odometry):
+    def on_number(self, number):
         future = self.client.call_async(Trigger.Request())
         rclpy.spin_until_future_complete(self.helper, future, timeout_sec=0.4)
         self.send(float(future.result().message) if future.done() else -1.0)
 
 
-class AskingFirst(Controller):
+class AskingFirst(Node):
     """Calls a service before it spins."""
 
     def __init__(self, name):
@@ -250,79 +217,96 @@ class AskingFirst(Controller):
         )
 
 
-class Growing(Controller):
-    """Creates another node at its first odometry."""
-
-    def on_odometry(self, odometry):
-        super().on_odometry(odometry)
-        if self.received == 1:
-            self.child = Ticker('child')
-            self.executor.add_node(self.child)
-
-
-class Spied(Controller):
-    """Creates a node that hears the same topic."""
-
-    def on_odometry(self, odometry):
-        super().on_odometry(odometry)
-        self.spy = Node('spy')
-        self.spy.create_subscription(Odometry, 'spied/odom', print, 10)
-
-
-class Sleeping(Controller):
-    def on_odometry(self, odometry):
-        time.sleep(0.004)
-        super().on_odometry(odometry)
-
-
-class Blocking(Controller):
-    """Waits in its callback for something that nobody sends."""
-
-    def on_odometry(self, odometry):
-        threading.Event().wait(0.05)
-        super().on_odometry(odometry)
-
-
-class Starting(Controller):
-    """Starts a process in its callback."""
-
-    def on_odometry(self, odometry):
-        subprocess.run(['sh', '-c', 'sleep 0.003'], check=True)
-        super().on_odometry(odometry)
-
-
-class WallTimer(Controller):
-    """Publishes in a timer on wall time, once it has received anything."""
+class Counting(Node):
+    """Has an action, and publishes its feedback."""
 
     def __init__(self, name):
         super().__init__(name)
+        self.action = importlib.import_module('test_msgs.action').Fibonacci
+        actions = importlib.import_module('rclpy.action')
+        self.server = actions.ActionServer(self, self.action, f'{name}/count', self.execute)
+
+    def execute(self, goal):
+        feedback = self.action.Feedback(sequence=[0, 1])
+        while len(feedback.sequence) < goal.request.order:
+            feedback.sequence.append(feedback.sequence[-1] + feedback.sequence[-2])
+            goal.publish_feedback(feedback)
+        goal.succeed()
+        return self.action.Result(sequence=feedback.sequence)
+
+
+# --- Attacks
+
+
+class Waiting(Echo):
+    """Sleeps in its callback at 0, starts a process at 2, or waits for what nobody sends."""
+
+    def on_number(self, number):
+        if number.data == 0.0:
+            time.sleep(0.004)
+        elif number.data == 2.0:
+            subprocess.run(['sh', '-c', 'sleep 0.003'], check=True)
+        else:
+            threading.Event().wait(0.05)
+        super().on_number(number)
+
+
+class Creating(Echo):
+    """Creates at a number what cannot take part, and destroys some of it at 0."""
+
+    def on_number(self, number):
+        super().on_number(number)
+        name, which = self.get_name(), number.data
+        if which == 0.0:
+            self.destroy_subscription(self.created) or self.destroy_publisher(self.created)
+        elif which == 1.0:
+            self.created = self.create_subscription(Float64, f'{name}/in', print, 10)
+        elif which == 2.0:
+            self.created = self.create_publisher(String, f'{name}/text', 10)
+        elif which == 3.0:
+            self.created = Node(name, start_parameter_services=False)
+        elif which == 4.0:
+            self.created = Node('spy')
+            self.created.create_subscription(Float64, f'{name}/in', print, 10)
+        else:
+            self.destroy_publisher(self.out)
+            self.out = self.create_publisher(Header, f'{name}/out', qos_profile_sensor_data)
+
+
+class WallTimer(Echo):
+    """Publishes in a timer on wall time, once it has received anything."""
+
+    def on_number(self, number):
         clock = rclpy.clock.Clock(clock_type=rclpy.clock.ClockType.STEADY_TIME)
-        self.create_timer(0.03, lambda: self.received and self.send(-1.0), clock=clock)
+        self.create_timer(0.03, lambda: self.send(-1.0), clock=clock)
 
 
-class Threaded(Controller):
+class Threaded(Echo):
     """Publishes in a thread of its own, once it has received anything."""
 
     def __init__(self, name):
         super().__init__(name)
+        self.received = False
         threading.Thread(target=self.work, daemon=True).start()
 
+    def on_number(self, number):
+        self.received = True
+
     def work(self):
-        turn = threading.Event()
-        while not turn.wait(0.02):
+        while not stopped.wait(0.02):
             if self.received:
                 self.send(-1.0)
 
 
-class Busy(Controller):
-    """Never stops to work, once it has received anything."""
+class Busy(Echo):
+    """Does not stop to work, once it has received anything."""
 
-    def on_odometry(self, odometry):
-        while True:
+    def on_number(self, number):
+        while not stopped.is_set():
             pass
 
 
-class Napping(Controller):
+class Napping(Echo):
     """A thread that polls on wall time."""
 
     def __init__(self, name):
@@ -330,92 +314,56 @@ class Napping(Controller):
         threading.Thread(target=self.poll, daemon=True).start()
 
     def poll(self):
-        while True:
+        while not stopped.is_set():
             time.sleep(0.01)
 
 
-class Mortal(Controller):
-    """Ends at a message, as it is told."""
+class Mortal(Echo):
+    """Ends with the exit code that it receives."""
 
-    def on_odometry(self, odometry):
-        super().on_odometry(odometry)
-        if self.received == LAST:
-            self.end()
-
-    def end(self):
+    def on_number(self, number):
+        super().on_number(number)
         print('out of memory', file=sys.stderr, flush=True)
-        os._exit(1)
+        os._exit(int(number.data))
 
 
-class Killed(Mortal):
-    def end(self):
-        os.kill(os.getpid(), signal.SIGSEGV)
-
-
-class Done(Mortal):
-    def end(self):
-        os._exit(0)
-
-
+CLASSES = [one for one in list(globals().values()) if isinstance(one, type) and issubclass(one, Node)]
 NODES = {
-    'repeater': Repeater,
+    **{one.__name__.lower(): one for one in CLASSES},
+    'bare': lambda name: Echo(name, start_parameter_services=False),
+    'untimed': lambda name: Echo(name, parameter_overrides=[Parameter('use_sim_time', value=False)]),
     'best_effort': lambda name: Repeater(name, qos_profile_sensor_data),
-    'changing': Changing,
-    'echo': Controller,
-    'mute': lambda name: Controller(name, answers=0),
-    'double': lambda name: Controller(name, answers=2),
-    'bare': lambda name: Controller(name, start_parameter_services=False),
-    'untimed': lambda name: Controller(
-        name, parameter_overrides=[Parameter('use_sim_time', value=False)]
-    ),
-    'ticker': Ticker,
-    'a': Stage,
-    'b': Stage,
-    'c': Stage,
-    'hearing': Hearing,
-    'caller': Caller,
-    'late': Late,
-    'counting': Counting,
-    'shared': Shared,
+    **dict.fromkeys(('a', 'b', 'c'), Stage),
     'other': Shared,
-    'sharing': Sharing,
-    'twice': Twice,
-    'asking': Asking,
-    'asking_first': AskingFirst,
-    'growing': Growing,
-    'spied': Spied,
-    'sleeping': Sleeping,
-    'blocking': Blocking,
-    'starting': Starting,
-    'wall_timer': WallTimer,
-    'threaded': Threaded,
-    'busy': Busy,
-    'napping': Napping,
-    'mortal': Mortal,
-    'killed': Killed,
-    'done': Done,
 }
+
+
+def spin(executor):
+    while not stopped.is_set():
+        executor.spin_once(timeout_sec=0.1)
 
 
 def main(arguments):
     if 'elsewhere' in arguments:
         os.environ['ROS_DOMAIN_ID'] = str(int(os.environ['ROS_DOMAIN_ID']) % 100 + 1)
+    names = [name for name in arguments if name in NODES]
+    if 'forked' in arguments and os.fork() == 0:
+        names = [names.pop()]
+    elif 'forked' in arguments:
+        names.pop()
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
-    stopped = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: stopped.set())
-    nodes = [NODES[name](name) for name in arguments if name in NODES]
-    threads = 4 if 'several_threads' in arguments else 1
-    executor = MultiThreadedExecutor(threads) if threads > 1 else SingleThreadedExecutor()
-    if 'several_executors' in arguments:
+    nodes = [NODES[name](name) for name in names]
+    executor = MultiThreadedExecutor(4) if 'threads' in arguments else SingleThreadedExecutor()
+    if 'threads' in arguments:
         other = SingleThreadedExecutor()
         other.add_node(nodes.pop())
-        threading.Thread(target=other.spin, daemon=True).start()
+        threading.Thread(target=spin, args=(other,), daemon=True).start()
     for node in nodes:
         executor.add_node(node)
-    while not stopped.is_set():
-        executor.spin_once(timeout_sec=0.1)
+    spin(executor)
     if 'polite' in arguments:
-        # A last command.
+        # A last message.
         nodes[0].send(-9.0)
 
 

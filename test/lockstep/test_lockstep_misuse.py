@@ -52,26 +52,23 @@ def test_invalid_times_are_refused(lockstep):
 
 
 def test_arguments_of_a_wrong_kind_are_refused(lockstep):
-    publishes = 'publish takes a topic and a message, got '
-    for use, words in (
-        (lambda: lockstep.add(Blinker), 'add takes a node, got the class Blinker; create one'),
-        (lambda: lockstep.add('blinker'), "add takes a node, got 'blinker'"),
+    for method, arguments, words in (
+        (lockstep.add, (Blinker,), 'add takes a node, got the class Blinker; create one'),
+        (lockstep.add, ('blinker',), "add takes a node, got 'blinker'"),
         (
-            lambda: lockstep.listen('twist', Twist),
-            "listen takes a type and a topic, got 'twist' and the class Twist",
+            lockstep.listen,
+            ('twist', Twist),
+            "a type and a topic, got 'twist' and the class Twist",
         ),
-        (
-            lambda: lockstep.publish(Vector3(), 'vector'),
-            f"{publishes}an object of the class Vector3 and 'vector'",
-        ),
-        (lambda: lockstep.publish('a', Vector3), f"{publishes}'a' and the class Vector3"),
-        (lambda: lockstep.publish('a', {}), f"{publishes}'a' and an object of the class dict"),
-        (lambda: lockstep.publish('a', b''), 'class bytes; serialized messages: node.create_publisher'),
-        (lambda: lockstep.publish('a', bytearray()), 'class bytearray; serialized messages: '),
-        (lambda: lockstep.last(Vector3), 'last takes a topic, got the class Vector3'),
+        (lockstep.publish, (Vector3(), 'a'), "a message, got an object of the class Vector3 and 'a'"),
+        (lockstep.publish, ('a', Vector3), "a message, got 'a' and the class Vector3"),
+        (lockstep.publish, ('a', {}), "a message, got 'a' and an object of the class dict"),
+        (lockstep.publish, ('a', b''), 'class bytes; serialized messages: node.create_publisher'),
+        (lockstep.publish, ('a', bytearray()), 'class bytearray; serialized messages: '),
+        (lockstep.last, (Vector3,), 'last takes a topic, got the class Vector3'),
     ):
         with refused(words):
-            use()
+            method(*arguments)
 
 
 def test_invalid_arguments_of_a_world_are_refused(lockstep):

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
@@ -29,16 +25,21 @@ from process_faults.outcome import Outcome, unexpected
 from process_faults.worlds import OUTPUTS, finite, quiet_world
 
 NODES = {
-    'virtual_robot': VirtualRobotParameters,
-    'go_to_goal': GoToGoalParameters,
-    'wheel_bridge': WheelBridgeParameters,
+    'virtual_robot': (VirtualRobot, VirtualRobotParameters),
+    'go_to_goal': (GoToGoal, GoToGoalParameters),
+    'wheel_bridge': (WheelBridge, WheelBridgeParameters),
 }
-DECLARED: dict[str, dict[str, tuple[Any, Any]]] = {
+INPUTS = {
+    'virtual_robot': [('cmd_vel', twist(0.3, 0.5))],
+    'go_to_goal': [('goal_pose', goal(2, 0)), ('odom', odometry(0, 0, 0))],
+    'wheel_bridge': [('cmd_vel', twist(0.3, 0.5))],
+}
+DECLARED = {
     node: {
         name: (specification, default_of(parameters, field))
         for name, (field, specification) in specifications(parameters).items()
     }
-    for node, parameters in NODES.items()
+    for node, (_, parameters) in NODES.items()
 }
 """Specification and default of each parameter of each node."""
 TEXTS = (
@@ -54,7 +55,7 @@ ATOMIC = 0.3
 """Share of changes of several parameters at once."""
 
 
-def candidates(specification: Any, default: Any) -> Iterator[Any]:
+def candidates(specification, default):
     """Yield values from the declaration of a parameter: the limits, beside them, and what is beyond."""
     bounds = [
         one for one in (specification.low, specification.high, specification.above) if one is not None
@@ -71,7 +72,7 @@ def candidates(specification: Any, default: Any) -> Iterator[Any]:
     yield default
 
 
-def value_of(chance: random.Random, specification: Any, default: Any) -> ParameterValue:
+def value_of(chance, specification, default):
     """Return a value: often one that may be allowed, else one of another type or none."""
     if chance.random() < 0.6:
         value = chance.choice(list(candidates(specification, default)))
@@ -88,7 +89,7 @@ def value_of(chance: random.Random, specification: Any, default: Any) -> Paramet
     return ParameterValue(type=number, **{field: value})
 
 
-def permitted(specification: Any, default: Any, value: Any) -> bool:
+def permitted(specification, default, value):
     """Return whether the declaration alone allows a value."""
     if type(value) is int and type(default) is float:
         value = float(value)
@@ -105,28 +106,42 @@ def permitted(specification: Any, default: Any, value: Any) -> bool:
     return inside and (above is None or value > above)
 
 
-def same(first: Any, second: Any) -> bool:
+def same(first, second):
     return type(first) is type(second) and (first == second or (first != first and second != second))
+
+
+def python(value):
+    return parameter_value_to_python(value) if value.type <= 9 else ('type', value.type)
+
+
+def in_use(default, value):
+    """Return a given value as the node has it: an integer may be given for a double."""
+    return float(value) if type(default) is float and value is not None else value
+
+
+def is_clear(reason):
+    return 0 < len(reason) <= 1000 and reason.isprintable()
 
 
 class Fuzzer:
     """Sets parameters of one running node."""
 
-    def __init__(self, world: Any, name: str, chance: random.Random) -> None:
+    def __init__(self, world, name, chance):
         self.name, self.chance, self.harness = name, chance, world.harness
-        self.known = DECLARED[name]
-        self.names = list(self.known)
+        self.known, self.violations, self.outputs = DECLARED[name], [], []
         self.child = world.start(name, '--ros-args', '-r', f'__ns:=/{name}')
         self.child.until_says('subscribed to')
         peer = self.harness.peer
-        path = f'/{name}/{name}'
-        self.set = peer.create_client(SetParameters, f'{path}/set_parameters')
-        self.set_all = peer.create_client(SetParametersAtomically, f'{path}/set_parameters_atomically')
-        self.get = peer.create_client(GetParameters, f'{path}/get_parameters')
-        for client in (self.set, self.set_all, self.get):
+        self._clients = {
+            kind: peer.create_client(kind, f'/{name}/{name}/{service}')
+            for kind, service in (
+                (SetParameters, 'set_parameters'),
+                (SetParametersAtomically, 'set_parameters_atomically'),
+                (GetParameters, 'get_parameters'),
+            )
+        }
+        for client in self._clients.values():
             self.harness.until(client.service_is_ready, f'services of {name}')
-        self.violations: list[str] = []
-        self.outputs: list[Any] = []
         self._inputs = [
             (peer.create_publisher(type(message), f'/{name}/{topic}', 10), message)
             for topic, message in INPUTS[name]
@@ -135,113 +150,84 @@ class Fuzzer:
         peer.create_subscription(kind, f'/{name}/{topic}', self.outputs.append, 100)
         self.values = self._values()
 
-    def change(self) -> None:
-        """Set one parameter, or a few at once, and check the answer and all values."""
+    def change(self):
+        """Set one parameter, or a few at once, and check the answer, all values, what is published."""
         number = self.chance.choice((2, 3, 5)) if self.chance.random() < ATOMIC else 1
-        changes = {}
-        for name in self.chance.sample(self.names, number):
-            changes[name] = value_of(self.chance, *self.known[name])
-        messages = [ParameterMessage(name=name, value=value) for name, value in changes.items()]
+        names = self.chance.sample(list(self.known), number)
+        values = {name: value_of(self.chance, *self.known[name]) for name in names}
+        messages = [ParameterMessage(name=name, value=value) for name, value in values.items()]
         if number == 1:
-            (result,) = self._call(self.set, SetParameters.Request(parameters=messages)).results
+            (result,) = self._call(SetParameters, parameters=messages).results
         else:
-            result = self._call(
-                self.set_all, SetParametersAtomically.Request(parameters=messages)
-            ).result
+            result = self._call(SetParametersAtomically, parameters=messages).result
         for publisher, message in self._inputs:
             publisher.publish(message)
-        self._check(changes, result)
-
-    def _check(self, changes: dict[str, ParameterValue], result: Any) -> None:
-        given = {name: self._python(value) for name, value in changes.items()}
-        what = f'{self.name}: {given!r:.300}'
-        allowed = [permitted(*self.known[name], value) for name, value in given.items()]
-        expected = dict(self.values)
+        given = {name: python(value) for name, value in values.items()}
+        expected, before, found = dict(self.values), self.values, []
         if result.successful:
-            for name, value in given.items():
-                double = type(self.known[name][1]) is float and value is not None
-                expected[name] = float(value) if double else value
-            if not all(allowed) and not self._unchanged(given):
-                self.violations.append(f'{what} was accepted')
-        elif not result.reason or not result.reason.isprintable() or len(result.reason) > 1000:
-            self.violations.append(f'{what} was refused without a clear reason: {result.reason!r:.200}')
+            expected |= {name: in_use(self.known[name][1], value) for name, value in given.items()}
+            allowed = all(permitted(*self.known[name], value) for name, value in given.items())
+            # Parameters that are read-only may be set to the values that they have.
+            if not allowed and not all(same(before[name], value) for name, value in given.items()):
+                found.append('was accepted')
+        elif not is_clear(result.reason):
+            found.append(f'was refused without a clear reason: {result.reason!r:.200}')
         self.values = self._values()
         wrong = [name for name, value in expected.items() if not same(self.values[name], value)]
-        if wrong:
-            self.violations.append(f'{what}: {wrong} differ from what was answered')
-        for message in self.outputs:
-            if not finite(message):
-                self.violations.append(f'{what}: published {str(message)[:200]}')
-                break
+        found += [f'{wrong} differ from what was answered'] if wrong else []
+        infinite = [one for one in self.outputs if not finite(one)]
+        found += [f'published {str(one)[:200]}' for one in infinite[:1]]
         self.outputs.clear()
-        if not self.child.running:
-            raise AssertionError(f'{what}: the node ended: {self.child.stderr[-500:]}')
+        self.violations += [f'{self.name}: {given!r:.300}: {one}' for one in found]
 
-    def _unchanged(self, given: dict[str, Any]) -> bool:
-        """Return whether only read-only parameters are set, to the values that they have."""
-        return all(same(self.values[name], value) for name, value in given.items())
+    def _values(self):
+        names = list(self.known)
+        values = self._call(GetParameters, names=names).values
+        return {name: python(value) for name, value in zip(names, values, strict=True)}
 
-    @staticmethod
-    def _python(value: ParameterValue) -> Any:
-        return parameter_value_to_python(value) if value.type <= 9 else ('type', value.type)
-
-    def _values(self) -> dict[str, Any]:
-        found = self._call(self.get, GetParameters.Request(names=self.names)).values
-        return {name: self._python(value) for name, value in zip(self.names, found, strict=True)}
-
-    def _call(self, client: Any, request: Any) -> Any:
-        future = client.call_async(request)
+    def _call(self, kind, **request):
+        future = self._clients[kind].call_async(kind.Request(**request))
         self.harness.until(lambda: future.done() or not self.child.running, f'answer of {self.name}')
         if not self.child.running:
             raise AssertionError(f'{self.name} ended: {self.child.stderr[-500:]}')
         return future.result()
 
 
-INPUTS: dict[str, list[tuple[str, Any]]] = {
-    'virtual_robot': [('cmd_vel', twist(0.3, 0.5))],
-    'go_to_goal': [('goal_pose', goal(2, 0)), ('odom', odometry(0, 0, 0))],
-    'wheel_bridge': [('cmd_vel', twist(0.3, 0.5))],
-}
-
-
-def start_up(harness: Any, chance: random.Random, count: int) -> list[str]:
-    """Create nodes with fuzzed values as given on the command line."""
-    classes = {'virtual_robot': VirtualRobot, 'go_to_goal': GoToGoal, 'wheel_bridge': WheelBridge}
+def start_up(harness, chance, count):
+    """Create nodes with fuzzed values as given on the command line; return what broke the promise."""
     violations = []
     for _ in range(count):
         node_name = chance.choice(list(NODES))
-        known = DECLARED[node_name]
-        given: dict[str, Any] = {}
+        known, given, found = DECLARED[node_name], {}, []
         for name in chance.sample(list(known), chance.choice((1, 1, 2))):
             value = value_of(chance, *known[name])
             if 1 <= value.type <= 4:
-                given[name] = parameter_value_to_python(value)
+                given[name] = python(value)
         overrides = [Parameter(name, value=value) for name, value in given.items()]
-        what = f'{node_name} started with {given!r:.300}'
         try:
-            node = classes[node_name](
+            node = NODES[node_name][0](
                 context=harness.context, namespace='/started', parameter_overrides=overrides
             )
         except ParameterError as error:
-            if not str(error) or not str(error).isprintable():
-                violations.append(f'{what}: refused without a clear reason: {error!r:.200}')
-            continue
-        for name, value in given.items():
-            specification, default = known[name]
-            actual = node.get_parameter(name).value
-            if not same(actual, float(value) if type(default) is float else value):
-                violations.append(f'{what}: {name} is {actual!r}')
-            if not permitted(replace(specification, read_only=False), default, value):
-                violations.append(f'{what}: was accepted')
-        node.destroy_node()
+            found += [] if is_clear(str(error)) else [f'refused without a clear reason: {error!r:.200}']
+        else:
+            for name, value in given.items():
+                specification, default = known[name]
+                actual = node.get_parameter(name).value
+                if not same(actual, in_use(default, value)):
+                    found.append(f'{name} is {actual!r}')
+                if not permitted(replace(specification, read_only=False), default, value):
+                    found.append('was accepted')
+            node.destroy_node()
+        violations += [f'{node_name} started with {given!r:.300}: {one}' for one in found]
     return violations
 
 
-def run(count: int, seed: int = 0) -> Outcome:
+def run(count, seed=0):
     """Set so many parameters of running nodes, and a tenth as many at the start of nodes."""
     chance = random.Random(seed)
-    violations: list[str] = []
-    with tempfile.TemporaryDirectory(prefix='parameters_') as name, quiet_world(Path(name)) as world:
+    violations, starts = [], max(3, count // 10)
+    with quiet_world() as world:
         fuzzers = [Fuzzer(world, node, chance) for node in NODES]
         for index in range(count):
             fuzzer = fuzzers[index % len(fuzzers)]
@@ -252,11 +238,10 @@ def run(count: int, seed: int = 0) -> Outcome:
                 break
             if index % 1000 == 999:
                 print(f'  {index + 1} of {count}', flush=True)
-        violations += start_up(world.harness, chance, max(3, count // 10))
+        violations += start_up(world.harness, chance, starts)
         for fuzzer in fuzzers:
             violations += fuzzer.violations
             fuzzer.child.signal(2)
             if fuzzer.child.exit() != 0 or unexpected(fuzzer.child.stderr):
                 violations.append(f'{fuzzer.name}: {unexpected(fuzzer.child.stderr)}')
-    tried = count + max(3, count // 10)
-    return Outcome(tried, violations, f'{count} at run time, {tried - count} at start-up')
+    return Outcome(count + starts, violations, f'{count} at run time, {starts} at start-up')

@@ -16,8 +16,7 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 from unittest import mock
@@ -25,7 +24,6 @@ from unittest import mock
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from support import processes
-from support.processes import Child, World
 
 from diffdrive_jacobian.bags.bag_reader import messages, open_bag
 from diffdrive_jacobian.signals import Signals
@@ -67,7 +65,7 @@ _numbers = itertools.count()
 class Recording:
     """A recorder in a process, and what is sent to it."""
 
-    def __init__(self, world: World, folder: Path, prefix: str, chance: random.Random) -> None:
+    def __init__(self, world, folder, prefix, chance):
         self.harness, self.chance = world.harness, chance
         self.bag = folder / 'run'
         # Another topic in each world: messages for the recorder before may still be under way.
@@ -76,12 +74,12 @@ class Recording:
         storage = chance.choice(('mcap', 'sqlite3'))
         with mock.patch.object(processes, 'PROGRAM', prefix + processes.PROGRAM):
             self.child = world.start('record_run', self.topic, '-o', str(self.bag), '-s', storage)
-        self.sent: list[bytes] = []
+        self.sent = []
         self.harness.until(
             lambda: self.publisher.get_subscription_count() or not self.child.running, 'it records'
         )
 
-    def send(self, seconds: float, size: int = 400) -> None:
+    def send(self, seconds, size=400):
         """Send for so long, or until the recorder ends."""
         end = time.monotonic() + seconds
         while time.monotonic() < end and self.child.running:
@@ -91,7 +89,7 @@ class Recording:
                 self.publisher.publish(data)
             self.harness.executor.spin_once(timeout_sec=0.01)
 
-    def end(self) -> int:
+    def end(self):
         self.child.signal(signal.SIGINT)
         return self.child.exit()
 
@@ -99,31 +97,24 @@ class Recording:
 # --- The faults
 
 
-@contextmanager
-def small_disk(folder: Path, size: int, options: str = '') -> Iterator[Path]:
-    """Mount a file system of so many bytes."""
-    folder.mkdir()
-    command = ['mount', '-t', 'tmpfs', '-o', f'size={size}{options}', 'none', str(folder)]
-    subprocess.run(command, check=True, capture_output=True)
+def full_disk(world, folder, chance):
+    small, size = folder / 'small', chance.choice((1 << 18, 1 << 19, 1 << 20))
+    small.mkdir()
+    mount = ['mount', '-t', 'tmpfs', '-o', f'size={size}', 'none', str(small)]
+    subprocess.run(mount, check=True, capture_output=True)
     try:
-        yield folder
-    finally:
-        subprocess.run(['umount', '--lazy', str(folder)], check=True)
-
-
-def full_disk(world: World, folder: Path, chance: random.Random) -> tuple[Recording, int]:
-    with small_disk(folder / 'small', chance.choice((1 << 18, 1 << 19, 1 << 20))) as small:
         made = Recording(world, small, '', chance)
         made.send(20.0)
         code = made.end()
-        # The disk is unmounted.
         shutil.copytree(small, folder / 'copy')
+    finally:
+        subprocess.run(['umount', '--lazy', str(small)], check=True)
     made.bag = folder / 'copy' / 'run'
     return made, code
 
 
-def failing(error: str) -> Callable[[World, Path, random.Random], tuple[Recording, int]]:
-    def run(world: World, folder: Path, chance: random.Random) -> tuple[Recording, int]:
+def failing(error):
+    def run(world, folder, chance):
         prefix = FAILING.format(error=error, writes=chance.randrange(2, 12))
         made = Recording(world, folder, prefix.strip() + '\n', chance)
         made.send(10.0)
@@ -132,14 +123,14 @@ def failing(error: str) -> Callable[[World, Path, random.Random], tuple[Recordin
     return run
 
 
-def slow_disk(world: World, folder: Path, chance: random.Random) -> tuple[Recording, int]:
+def slow_disk(world, folder, chance):
     prefix = SLOW.format(seconds=chance.choice((0.05, 0.2, 0.4)))
     made = Recording(world, folder, prefix.strip() + '\n', chance)
     made.send(2 * SECONDS)
     return made, made.end()
 
 
-def removed_folder(world: World, folder: Path, chance: random.Random) -> tuple[Recording, int]:
+def removed_folder(world, folder, chance):
     place = folder / 'place'
     place.mkdir()
     made = Recording(world, place, '', chance)
@@ -155,10 +146,8 @@ def removed_folder(world: World, folder: Path, chance: random.Random) -> tuple[R
     return made, code
 
 
-def limited(
-    kind: int, limit: Callable[[int, random.Random], int]
-) -> Callable[..., tuple[Recording, int]]:
-    def run(world: World, folder: Path, chance: random.Random) -> tuple[Recording, int]:
+def limited(kind, limit):
+    def run(world, folder, chance):
         made = Recording(world, folder, '', chance)
         made.send(chance.uniform(0.3, SECONDS))
         pid = made.child._process.pid
@@ -170,20 +159,20 @@ def limited(
     return run
 
 
-def few_descriptors(pid: int, chance: random.Random) -> int:
+def few_descriptors(pid, chance):
     return len(os.listdir(f'/proc/{pid}/fd')) + chance.choice((0, 0, 1, 2, 3, 5))
 
 
-def little_memory(pid: int, chance: random.Random) -> int:
+def little_memory(pid, chance):
     pages = int(Path(f'/proc/{pid}/statm').read_text().split()[0])
     return pages * resource.getpagesize() + chance.choice((0, 1 << 20, 8 << 20, 32 << 20))
 
 
-def short_files(pid: int, chance: random.Random) -> int:
+def short_files(pid, chance):
     return chance.choice((1 << 18, 1 << 19, 1 << 20))
 
 
-FAULTS: dict[str, Callable[[World, Path, random.Random], tuple[Recording, int]]] = {
+FAULTS = {
     'full disk': full_disk,
     'disk that becomes read-only': failing('EROFS'),
     'disk that fails': failing('EIO'),
@@ -196,35 +185,33 @@ FAULTS: dict[str, Callable[[World, Path, random.Random], tuple[Recording, int]]]
 }
 
 
-def read(bag: Path) -> list[bytes]:
+def read(bag):
     with open_bag(bag) as reader:
         return [bytes(data) for _, _, data in messages(reader, reader.connections)]
 
 
-def check(fault: str, made: Recording, code: int, folder: Path) -> list[str]:
+def check(fault, made, code, folder):
     """Return what broke the promise."""
-    child: Child = made.child
-    violations = []
+    stderr, violations = made.child.stderr, []
     # What C++ code does without memory is not ours. It is as a crash then.
     killed = fault == 'little memory' and code < 0
     if code not in (0, 1) and not killed:
-        violations.append(f'exit code {code}: {child.stderr[-300:]!r}')
-    if (line := unexpected(child.stderr)) and not killed:
-        violations.append(f'printed {line!r}: {child.stderr[-600:]!r}')
-    if code == 1 and 'record_run: error: ' not in child.stderr.splitlines()[-1]:
-        violations.append(f'the last line is {child.stderr.splitlines()[-1:]!r}')
-    if made.bag.is_dir():
-        found = read(made.bag)
-    else:
-        what = made.bag
+        violations.append(f'exit code {code}: {stderr[-300:]!r}')
+    if (line := unexpected(stderr)) and not killed:
+        violations.append(f'printed {line!r}: {stderr[-600:]!r}')
+    if code == 1 and 'record_run: error: ' not in stderr.splitlines()[-1]:
+        violations.append(f'the last line is {stderr.splitlines()[-1:]!r}')
+    if list(made.bag.parent.glob('.*building*')):
+        violations.append('the directory in which the bag was written is left')
+    bag = made.bag
+    if not bag.is_dir():
+        bag = folder / 'recovered'
         with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as said:
-            recovered = recover_run([str(what), '-o', str(folder / 'recovered')], Signals())
+            recovered = recover_run([str(made.bag), '-o', str(bag)], Signals())
         if recovered != 0:
-            return [
-                *violations,
-                f'not recovered: {said.getvalue()!r}; recorder: {child.stderr[-300:]!r}',
-            ]
-        found = read(folder / 'recovered')
+            return [*violations, f'not recovered: {said.getvalue()!r}; recorder: {stderr[-300:]!r}']
+    with open_bag(bag) as reader:
+        found = [bytes(data) for _, _, data in messages(reader, reader.connections)]
     if not found:
         return [*violations, 'no message was saved']
     first = made.sent.index(found[0]) if found[0] in made.sent else -1
@@ -232,28 +219,21 @@ def check(fault: str, made: Recording, code: int, folder: Path) -> list[str]:
         violations.append('the messages are not those that were sent, without a gap')
     if code == 0 and len(found) < len(made.sent) - first:
         violations.append(f'exit code 0, but {len(made.sent) - first - len(found)} messages are missing')
-    if list(made.bag.parent.glob('.*building*')):
-        violations.append('the directory in which the bag was written is left')
     return violations
 
 
-def run(count: int, seed: int = 0, faults: tuple[str, ...] = tuple(FAULTS)) -> Outcome:
+def run(count, seed=0):
     """Record so often under each fault."""
     chance = random.Random(seed)
-    violations: list[str] = []
-    codes: dict[str, list[int]] = {}
-    with tempfile.TemporaryDirectory(prefix='recording_') as name:
-        place = Path(name)
-        (place / 'world').mkdir()
-        with quiet_world(place / 'world') as world:
-            for index in range(count):
-                for fault in faults:
-                    folder = place / f'{index}_{fault.replace(" ", "_")}'
-                    folder.mkdir()
-                    made, code = FAULTS[fault](world, folder, chance)
-                    found = check(fault, made, code, folder)
-                    violations += [f'{fault}: {one}' for one in found]
-                    codes.setdefault(fault, []).append(code)
-                    shutil.rmtree(folder)
-    measured = ', '.join(f'{fault} {sorted(set(found))}' for fault, found in codes.items())
-    return Outcome(count * len(faults), violations, f'exit codes: {measured}')
+    violations, codes = [], {fault: set() for fault in FAULTS}
+    with tempfile.TemporaryDirectory(prefix='recording_') as name, quiet_world() as world:
+        for index in range(count):
+            for fault, inject in FAULTS.items():
+                folder = Path(name) / f'{index}_{fault.replace(" ", "_")}'
+                folder.mkdir()
+                made, code = inject(world, folder, chance)
+                violations += [f'{fault}: {one}' for one in check(fault, made, code, folder)]
+                codes[fault].add(code)
+                shutil.rmtree(folder)
+    measured = ', '.join(f'{fault} {sorted(found)}' for fault, found in codes.items())
+    return Outcome(count * len(FAULTS), violations, f'exit codes: {measured}')

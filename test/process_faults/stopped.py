@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import random
 import signal
-import tempfile
 import time
-from pathlib import Path
 
 from support.ros_messages import goal
 
@@ -32,59 +30,48 @@ MUST_STOP = {
 """What must be still in time when a node is lost. Behind a bridge that is alive two timeouts add up."""
 
 
-def disturb(team: Team, name: str, kill: bool, chance: random.Random) -> tuple[list[str], list[float]]:
+def disturb(team, name, kill, chance):
     """Disturb a node while it drives; return what broke the promise, and how soon the others stopped."""
-    what = f'{name}, {"SIGKILL" if kill else "SIGSTOP"}'
-    drive(team)
+    sent = 0.0
+    while not team.drives():
+        if time.monotonic() > sent + 1.0:
+            sent = time.monotonic()
+            team.goal.publish(goal(200, 0))
+        spin(team.harness, 0.01)
     spin(team.harness, chance.uniform(0.0, 0.6))
-    node = team.nodes[name]
+    node, violations, delays = team.nodes[name], [], []
     node.signal(signal.SIGKILL if kill else signal.SIGSTOP)
     since = time.monotonic()
     spin(team.harness, HOLD + chance.uniform(0.3, 1.5))
-    violations, delays = [], []
     for topic in MUST_STOP[name]:
         delays.append(team.moved[topic] - since)
         if delays[-1] > TIMEOUT + LATE:
-            violations.append(f'{what}: {topic} was not zero for {delays[-1]:.2f} s')
+            violations.append(f'{topic} was not zero for {delays[-1]:.2f} s')
         if moves(team.last[topic]):
-            violations.append(f'{what}: {topic} is not zero at the end')
+            violations.append(f'{topic} is not zero at the end')
     if kill:
         node.exit()
         team.start(name)
     else:
         node.signal(signal.SIGCONT)
-    if line := next((found for one in team.nodes.values() if (found := unexpected(one.stderr))), ''):
-        violations.append(f'{what}: printed {line!r}')
+    printed = [line for one in team.nodes.values() if (line := unexpected(one.stderr))]
+    violations += [f'printed {line!r}' for line in printed[:1]]
     if not team.arrives():
-        violations.append(f'{what}: afterwards the robot does not arrive')
-    return violations, delays
+        violations.append('afterwards the robot does not arrive')
+    what = f'{name}, {"SIGKILL" if kill else "SIGSTOP"}'
+    return [f'{what}: {one}' for one in violations], delays
 
 
-def drive(team: Team) -> None:
-    """Send a goal that is far away until the robot moves."""
-    sent = 0.0
-
-    def drives() -> bool:
-        nonlocal sent
-        if time.monotonic() > sent + 1.0:
-            sent = time.monotonic()
-            team.goal.publish(goal(200, 0))
-        return team.drives()
-
-    team.harness.until(drives, 'the robot drives')
-
-
-def run(count: int, seed: int = 0) -> Outcome:
+def run(count, seed=0):
     """Disturb so often, each node in turn."""
     chance = random.Random(seed)
-    violations: list[str] = []
-    delays: list[float] = []
-    with tempfile.TemporaryDirectory(prefix='stopped_') as name, quiet_world(Path(name)) as world:
+    violations, delays = [], []
+    with quiet_world() as world:
         team = Team(world)
         for index in range(count):
-            node = list(MUST_STOP)[index % len(MUST_STOP)]
-            found, measured = disturb(team, node, kill=index // len(MUST_STOP) % 2 == 0, chance=chance)
+            name = list(MUST_STOP)[index % len(MUST_STOP)]
+            found, measured = disturb(team, name, index // len(MUST_STOP) % 2 == 0, chance)
             violations += found
-            print(f'  {index + 1} of {count}: {found}', flush=True)
             delays += [one for one in measured if one >= 0.0]
+            print(f'  {index + 1} of {count}: {found}', flush=True)
     return Outcome(count, violations, f'the others are still after {spread(delays, "s")}')

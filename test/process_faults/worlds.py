@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from functools import partialmethod
 from io import StringIO
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 from action_msgs.msg import GoalStatus
@@ -18,7 +17,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from support import processes
 from support.harness import Harness
-from support.processes import Child, World, open_world
+from support.processes import Child, open_world
 from support.ros_messages import goal
 
 LIFE = 900.0
@@ -40,17 +39,18 @@ PATIENCE = 120.0
 
 
 @contextmanager
-def quiet_world(folder: Path, life: float = LIFE) -> Iterator[World]:
+def quiet_world(folder=None, life=LIFE):
     """Open a world whose processes may live so long (s). It prints nothing at its end."""
     until = partialmethod(Harness.until, patience=PATIENCE)
     with (
+        tempfile.TemporaryDirectory(prefix='process_faults_') as temporary,
         mock.patch.object(processes, 'LIMIT', life),
         mock.patch.object(processes, 'PATIENCE', PATIENCE),
         mock.patch.object(Harness, 'until', until),
         mock.patch.object(Child, 'exit', partialmethod(Child.exit, patience=PATIENCE)),
         ExitStack() as stack,
     ):
-        world = stack.enter_context(open_world(folder))
+        world = stack.enter_context(open_world(folder or Path(temporary)))
         try:
             yield world
         finally:
@@ -58,29 +58,29 @@ def quiet_world(folder: Path, life: float = LIFE) -> Iterator[World]:
                 stack.close()
 
 
-def spin(harness: Harness, seconds: float) -> None:
+def spin(harness, seconds):
     """Receive messages for a time (s)."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         harness.executor.spin_once(timeout_sec=0.005)
 
 
-def _twist(message: Any) -> Any:
-    return message.twist.twist if isinstance(message, Odometry) else message
-
-
-def moves(message: Any) -> bool:
-    """Return whether an Odometry, a Twist or a JointState says that the robot moves."""
+def speeds(message):
+    """Return the speeds in an Odometry, a Twist or a JointState."""
     if isinstance(message, JointState):
-        return any(message.velocity)
-    return bool(_twist(message).linear.x or _twist(message).angular.z)
+        return list(message.velocity)
+    twist = message.twist.twist if isinstance(message, Odometry) else message
+    return [twist.linear.x, twist.angular.z]
 
 
-def finite(message: Any) -> bool:
+def moves(message):
+    """Return whether a message says that the robot moves."""
+    return any(speeds(message))
+
+
+def finite(message):
     """Return whether all numbers that a node publishes are finite."""
-    if isinstance(message, JointState):
-        return all(map(math.isfinite, message.velocity))
-    numbers = [_twist(message).linear.x, _twist(message).angular.z]
+    numbers = speeds(message)
     if isinstance(message, Odometry):
         pose = message.pose.pose
         numbers += [pose.position.x, pose.position.y, pose.orientation.z, pose.orientation.w]
@@ -91,27 +91,27 @@ def finite(message: Any) -> bool:
 class Team:
     """A robot, a bridge and a controller in processes, and what is heard of them."""
 
-    def __init__(self, world: World, space: str = '', **parameters: object) -> None:
+    def __init__(self, world, space='', **parameters):
         """Start the nodes in a namespace, with some parameters besides those of TEAM."""
         self.world, self.harness = world, world.harness
         self._space, self._parameters = space, parameters
-        self.last: dict[str, Any] = {}
+        self.last = {}
         """The last message on each topic."""
-        self.moved: dict[str, float] = {}
+        self.moved = {}
         """When the last message on each topic came that is not zero (s, monotonic)."""
-        self.infinite: list[str] = []
+        self.infinite = []
         """Messages with numbers that are not finite."""
         for kind, topic in OUTPUTS.values():
             self._hear(kind, topic)
         self.statuses = self.harness.listen(GoalStatus, f'{space}/goal_status', latched=True)
         self.goal = self.harness.peer.create_publisher(PoseStamped, f'{space}/goal_pose', 20)
-        self.nodes: dict[str, Child] = {}
+        self.nodes = {}
         for name in TEAM:
             self.start(name)
         self.harness.until(self.goal.get_subscription_count, 'the controller is there')
 
-    def _hear(self, kind: Any, topic: str) -> None:
-        def on_message(message: Any) -> None:
+    def _hear(self, kind, topic):
+        def on_message(message):
             self.last[topic] = message
             if moves(message):
                 self.moved[topic] = when(message)
@@ -120,7 +120,7 @@ class Team:
 
         self.harness.peer.create_subscription(kind, f'{self._space}/{topic}', on_message, 1000)
 
-    def start(self, name: str) -> None:
+    def start(self, name):
         """Start a node, again if it has ended."""
         values = {**TEAM[name], **self._parameters}
         rules = [word for one, value in values.items() for word in ('-p', f'{one}:={value}')]
@@ -128,11 +128,11 @@ class Team:
         self.nodes[name] = self.world.start(name, '--ros-args', *space, *rules)
         self.nodes[name].until_says('subscribed to')
 
-    def drives(self) -> bool:
+    def drives(self):
         """Return whether the robot moves."""
         return 'odom' in self.last and moves(self.last['odom'])
 
-    def arrives(self, tick: Callable[[], object] | None = None) -> bool:
+    def arrives(self, tick=None):
         """Send goals near to where the robot is; return whether one is reached, and the robot stands."""
         tick = tick or (lambda: self.harness.executor.spin_once(timeout_sec=0.01))
         end, sent, reached = time.monotonic() + 40.0, -math.inf, False
@@ -149,7 +149,7 @@ class Team:
         return True
 
 
-def when(message: Any) -> float:
+def when(message):
     """Return the time of a message (s, monotonic): its stamp if it has that of its publication."""
     if not isinstance(message, Odometry):
         return time.monotonic()

@@ -1,0 +1,374 @@
+"""What goes wrong with processes in a lockstep world is named. The processes end, whatever happens."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from forked_nodes import started_in_forks
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from std_msgs.msg import Float64, String
+from std_srvs.srv import Trigger
+from test_external import command, send
+
+from diffdrive_jacobian.lockstep.external import datagrams, node_process
+from diffdrive_jacobian.lockstep.external import process as external_process
+from diffdrive_jacobian.lockstep.external import quiet as quietness
+from diffdrive_jacobian.lockstep.external.process import ExternalProcess
+from diffdrive_jacobian.testing import Lockstep, LockstepError
+
+
+@pytest.fixture(autouse=True, scope='module')
+def forks():
+    """Nodes of `external_nodes` run in forks. Other programs are started as usual."""
+    with started_in_forks():
+        yield
+
+
+def fails(match):
+    return pytest.raises(LockstepError, match=match)
+
+
+# --- While it runs
+
+
+@pytest.fixture(scope='class')
+def process():
+    nodes = command('echo', 'repeater', 'asking', 'creating')
+    with Lockstep() as world:
+        process = world.start([*nodes, '--ros-args', '-p', 'times:=1000'], clock_period=1.0)
+        process.world = world
+        yield process
+
+
+@pytest.fixture(scope='class')
+def world(process):
+    return process.world
+
+
+class TestWhileItRuns:
+    """One process. Each test leaves it as it was, but for the last one."""
+
+    @pytest.mark.parametrize(
+        ('number', 'words'),
+        [
+            (1.0, '/creating has 2 subscriptions to /creating/in: which of them'),
+            (2.0, r'type std_msgs/msg/String of /creating/text of /creating cannot be imported'),
+        ],
+    )
+    def test_what_cannot_take_part_for_a_while_is_named(self, world, monkeypatch, number, words):
+        with monkeypatch.context() as patched:
+            patched.delattr('std_msgs.msg.String')
+            with fails(words):
+                send(world, 'creating', number)
+                world.run_for(10.0)
+        send(world, 'creating', 0.0)
+        world.run_for(1.0)
+
+    def test_a_node_that_stops_to_follow_simulated_time_is_named(self, world):
+        def follow(value):
+            message = Parameter('use_sim_time', value=value).to_parameter_msg()
+            request = SetParameters.Request(parameters=[message])
+            world.call(SetParameters, 'echo/set_parameters', request)
+            world.run_for(5.0)
+
+        with fails('/echo has stopped to follow simulated time'):
+            follow(False)
+        follow(True)
+
+    def test_more_messages_at_once_than_are_received_are_an_error(self, world):
+        with fails(r'more than 999 messages .* on /repeater/out at once'):
+            world.publish('repeater/in', String(data='x'))
+
+    def test_a_callback_whose_wait_ends_before_the_response_is_an_error(self, world):
+        def answer(_, response):
+            time.sleep(0.7)
+            return response
+
+        world.node.create_service(Trigger, 'asking/ask', answer)
+        with fails(r'/asking.* waited for the response of a service until its'):
+            send(world, 'asking', 0.0)
+
+
+def test_a_process_that_is_never_quiet_or_stopped_is_named_with_its_thread(lockstep):
+    process = lockstep.start(command('busy', 'echo'), patience=0.5)
+    with fails(r"(?s)/busy, /echo not quiet within 0.5 s: thread \d+ \('\w+'\) of .* is running"):
+        send(lockstep, 'busy', 0.0)
+    process.signal(signal.SIGSTOP)
+    with fails('(?s)/echo not quiet within 0.5 s: thread .* is stopped'):
+        send(lockstep, 'echo', 0.0)
+
+
+@pytest.mark.parametrize(
+    ('number', 'words'),
+    [
+        (3.0, 'several nodes of .* have the name /creating'),
+        (4.0, r'several nodes of .* share /creating/in, which cannot be'),
+        (5.0, '/creating/out with several qualities.*BEST_EFFORT'),
+    ],
+)
+def test_what_is_created_later_and_cannot_take_part_is_named(lockstep, number, words):
+    lockstep.start(command('creating'))
+    with fails(words):
+        send(lockstep, 'creating', number)
+        lockstep.run_for(10.0)
+
+
+def test_what_a_process_sends_by_itself_is_an_error(lockstep):
+    lockstep.start(command('walltimer', 'threaded'), clock_period=1.0)
+    for name in ('walltimer', 'threaded'):
+        send(lockstep, name, 0.0)
+        said = ''
+        while f'published /{name}/out' not in said.replace('/walltimer/out, published ', ''):
+            with fails(
+                r' published /.*/out at .* while nothing was delivered to it.*wall time'
+            ) as caught:
+                for _ in range(1000):
+                    lockstep.run_for(1.0)
+                    time.sleep(0.02)
+            said = str(caught.value)
+
+
+def test_messages_that_do_not_fit_into_the_queue_of_a_socket_are_an_error(monkeypatch):
+    monkeypatch.setattr(datagrams, 'QUEUE', 50_000)
+    monkeypatch.setattr(datagrams, 'SO_RCVBUFFORCE', socket.SO_RCVBUF)
+    with Lockstep() as world:
+        world.start(command('repeater', 'best_effort'))
+        for name in ('best_effort', 'repeater'):
+            with fails(rf'messages to or from .*/{name}.* were lost .*rmem_max='):
+                for _ in range(3):
+                    world.publish(f'{name}/in', String(data='x' * 700_000))
+                world.finish()
+
+
+def test_a_process_that_ends_while_driving_is_quoted(lockstep):
+    process = lockstep.start(command('mortal'))
+    publisher = lockstep.node.create_publisher(Float64, 'mortal/in', 10)
+    lockstep.node.create_timer(0.1, lambda: publisher.publish(Float64(data=1.0)))
+    with fails(r'(?s)/mortal: .*has exited with 1\n.*out of memory'):
+        lockstep.run_for(10.0)
+    assert '/mortal/out: ' in lockstep.report()
+    assert process.returncode == 1
+
+
+# --- At the start
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'options', 'words'),
+    [
+        (
+            [*command('shared', 'other'), '--ros-args', '-r', 'words:=sentences'],
+            {},
+            'several nodes of .* share /sentences, which',
+        ),
+        (command('untimed'), {}, '/untimed of .* not subscribed to /clock: its parameter use_sim_time'),
+        (
+            command('napping'),
+            {'patience': 0.5},
+            r'(?s)not quiet .*: thread .* (sleeps|is running)',
+        ),
+        (
+            command('echo', 'elsewhere'),
+            {'timeout': 2.0},
+            r'it is in ROS domain \d+ instead of \d+: it must not set ROS_DOMAIN_ID',
+        ),
+        (
+            ['sh', '-c', 'echo no such file >&2; exit 3'],
+            {},
+            r'(?s)has exited with 3\n.*stderr:\n +no such file',
+        ),
+        (
+            ['sh', '-c', 'echo still here >&2; sleep 20'],
+            {'timeout': 0.2},
+            r'no node of sh .* was discovered within 0.2 s \(timeout=\): it has created none',
+        ),
+        (['sh', '-c', 'sleep 60 &'], {}, 'start it in the foreground'),
+    ],
+)
+def test_a_process_that_cannot_take_part_is_refused(lockstep, arguments, options, words):
+    with fails(words):
+        lockstep.start(arguments, **options)
+
+
+def test_several_nodes_in_cpp_are_warned_of(lockstep, monkeypatch, recwarn):
+    # As if it were in C++: a library that the process has.
+    monkeypatch.setattr(quietness, 'RCLCPP', '_rclpy_pybind11')
+    lockstep.start(command('echo'))
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match='rclcpp calls timers of one of several nodes') as warned:
+        lockstep.start(command('ticker', 'bare'))
+    assert warned[0].filename == __file__
+
+
+def test_random_addresses_are_refused(lockstep, monkeypatch):
+    monkeypatch.setattr(external_process, 'ADDR_NO_RANDOMIZE', 1)
+    with fails('seccomp=unconfined'):
+        lockstep.start(command('echo'))
+
+
+def test_another_system_is_refused(lockstep, monkeypatch):
+    monkeypatch.setattr(quietness.platform, 'machine', lambda: 'riscv64')
+    with fails('need Linux on x86_64 or aarch64'):
+        lockstep.start(['true'])
+
+
+def start_and_run(world, arguments):
+    """A node may be discovered only after some seconds."""
+    world.start(arguments)
+    for _ in range(2000):
+        world.run_for(0.1)
+
+
+def test_several_processes_with_nodes_are_refused(lockstep):
+    with fails(r'has started several processes with nodes: \d+, \d+'):
+        start_and_run(lockstep, command('forked', 'echo', 'bare'))
+
+
+def test_a_process_that_the_world_has_not_started_is_refused(lockstep, monkeypatch):
+    domain = external_process.free_domain()
+    monkeypatch.setattr(node_process, 'free_domain', lambda: domain)
+    foreign = ExternalProcess(command('echo'), {'ROS_DOMAIN_ID': str(domain)})
+    try:
+        with fails(r'node /echo is in domain \d+, but in no process that'):
+            lockstep.start(['sh', '-c', 'sleep 60'])
+    finally:
+        foreign.kill()
+        foreign.close()
+
+
+def test_start_takes_a_program_and_its_arguments(lockstep):
+    for wrong in ('ros2 run package node', [], (), ['ros2', 3], ['a\0b'], 3, b'ab', None):
+        with fails('start takes a program and its arguments'):
+            lockstep.start(wrong)
+    with fails(r'cannot be started: .*No such file'):
+        lockstep.start(['no_such_program'])
+    with pytest.raises(ValueError, match='clock_period must be'):
+        lockstep.start(['true'], clock_period=0.0)
+    for name, wrong in [
+        *(('env', env) for env in (3, {'A': 1}, {'A=B': 'x'}, {'': 'x'}, {'A': '\0'}, {1: 'x'})),
+        *(('queue_depth', depth) for depth in (0, -3, 2.5, True, '10', 1000)),
+        *(('cwd', cwd) for cwd in (3, 'a\0b')),
+    ]:
+        with fails(rf'{name} must be .*, got '):
+            lockstep.start(['true'], **{name: wrong})
+    for cwd in ('/no/such/folder', __file__):
+        with fails(r'cannot be started: .*(No such|Not a)'):
+            lockstep.start(['true'], cwd=cwd)
+
+
+# --- Processes
+
+
+@pytest.fixture
+def started():
+    """Return a function that starts a shell command, which is ended with the test."""
+    processes = []
+
+    def start(text, until=''):
+        processes.append(ExternalProcess(['sh', '-c', text]))
+        while until not in processes[-1].printed(0):
+            assert processes[-1].returncode is None
+        return processes[-1]
+
+    yield start
+    external_process.end_all(processes)
+
+
+def test_a_process_and_its_children_are_ended(started):
+    stubborn = started('trap "" INT; echo hi; sleep 60 & wait; sleep 60', until='hi')
+    assert 'is running' in stubborn.describe()
+    assert stubborn.stop(timeout=0.1) == -signal.SIGKILL
+    polite = started('trap "echo bye; exit 7" INT; echo hi; while :; do sleep 0.05; done', until='hi')
+    assert polite.stop() == 7
+    assert polite.printed(0) == 'hi\nbye\n'
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('kill -SEGV $$', 'was ended by SIGSEGV'),
+        # As `ros2 run`, which is the parent of the node, and a shell.
+        ('exit 245', 'has exited with 245: what it started was ended by SIGSEGV'),
+        ('exit 139', 'has exited with 139: what it started was ended by SIGSEGV'),
+        ("printf '\\033[2J%1000000d' 1; exit 3", r'(?s)has exited with 3\n  stdout:\n.{100,1000}$'),
+    ],
+)
+def test_the_end_of_a_process_is_described(started, text, words):
+    process = started(text)
+    while process.returncode is None:
+        time.sleep(0.001)
+    with fails(words) as caught:
+        process.check_running()
+    assert '\033' not in str(caught.value)
+
+
+def test_a_process_in_a_session_of_its_own_is_ended_with_the_world(started):
+    """As the daemon of ros2, and what that has started."""
+    launcher = started('setsid sh -c "echo hi; sleep 60" & sleep 60', until='hi')
+    left = set(quietness.Quiet(launcher.root, ()).processes())
+    assert len(left) >= 4
+    launcher.kill()
+    assert not any(Path(f'/proc/{pid}').exists() for pid in left)
+
+
+WORLD = """
+import sys, time
+from diffdrive_jacobian.lockstep.external.process import ExternalProcess
+from diffdrive_jacobian.lockstep.external.quiet import Quiet
+process = ExternalProcess(['sh', '-c', 'echo hi; sleep 60 & sleep 60'])
+while not process.printed(0):
+    time.sleep(0.001)
+print(*Quiet(process.root, ()).processes(), flush=True)
+time.sleep(60.0)
+"""
+
+
+def test_nothing_is_left_of_a_world_that_is_killed():
+    """As by a time limit of the tests."""
+    world = ExternalProcess([sys.executable, '-c', WORLD])
+    while not (printed := world.printed(0)).endswith('\n'):
+        world.check_running()
+        time.sleep(0.01)
+    left = set(map(int, printed.split()))
+    assert len(left) >= 3
+    os.kill(world.pid, signal.SIGKILL)
+    while any(Path(f'/proc/{pid}').exists() for pid in left):
+        time.sleep(0.01)
+    world.close()
+
+
+def test_a_process_receives_sigint_that_the_tests_ignore(started):
+    """As they do if a shell has started them in the background."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        process = started('exec sleep 60')
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        assert process.stop() == -signal.SIGINT
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_domain_with_a_port_in_use_is_not_chosen(monkeypatch):
+    domains = sorted({external_process.free_domain() for _ in range(10)})
+    assert len(domains) > 1
+    # Those that others use.
+    assert min(domains) > 101
+    monkeypatch.delenv('PYTEST_XDIST_WORKER', raising=False)
+    monkeypatch.delenv('PYTEST_XDIST_WORKER_COUNT', raising=False)
+    first, second = domains[:2]
+    monkeypatch.setattr(external_process, 'DOMAINS', [first, second])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        # Of the fourth participant: the first may have ended before.
+        taken.bind(('', external_process._ports(first)[4]))
+        assert {external_process.free_domain() for _ in range(4)} == {second}
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+            other.bind(('', external_process._ports(second)[0]))
+            with fails(f'from {first} to {second} are all in use'):
+                external_process.free_domain()
