@@ -17,8 +17,8 @@ from support.harness import PATIENCE
 from diffdrive_jacobian.bags.journal import Channel, Message
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError
 from diffdrive_jacobian.recording import reception, recorder
-from diffdrive_jacobian.recording.recorder import Recorder, Selection
 from diffdrive_jacobian.recording.reception import MissedMessages
+from diffdrive_jacobian.recording.recorder import Recorder, Selection
 from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage
 from diffdrive_jacobian.ros.runner import ros_context
 
