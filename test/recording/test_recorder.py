@@ -400,10 +400,7 @@ def test_invalid_topic_names_of_dds_applications_are_reported_once(ros, monkeypa
 
 
 def test_a_topic_whose_type_is_not_installed_makes_the_recording_incomplete(ros, monkeypatch):
-    def message_class(name):
-        raise UnknownTypeError('no Twist')
-
-    monkeypatch.setattr(recorder, 'message_class', message_class)
+    monkeypatch.setattr(recorder, 'message_class', mock.Mock(side_effect=UnknownTypeError('no Twist')))
     publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
     setting = Setting(ros)
     setting.until(lambda: setting.sink.left_out)

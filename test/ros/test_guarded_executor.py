@@ -6,7 +6,6 @@ import time
 from functools import partial
 
 import pytest
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
@@ -210,26 +209,6 @@ def test_a_load_that_only_the_events_executor_can_handle_moves_back_in_the_end(m
     served.until_received(sent[-1])
 
 
-def test_messages_that_were_announced_before_are_taken_before_nodes_move_back(served):
-    # The middleware does not announce them again.
-    served.listen()
-    served.publish(range(50))
-    served.move()
-    served.move()
-    assert len(served.received) == 50
-    served.publish(['after'])
-    served.until_received('after')
-
-
-def test_nodes_that_were_destroyed_are_moved_too(monkeypatch, served):
-    monkeypatch.setattr(guarded_executor, 'LONGEST_HOLD', 0.0)
-    for node in served.nodes:
-        node.destroy_node()
-    served.move()
-    served.move()
-    assert not served.executor.fair
-
-
 async def _awaiting(take, message):
     take(message)
 
@@ -250,12 +229,6 @@ def test_callbacks_that_need_a_wait_set_get_it(served, make_callback):
     served.spin(lambda: received)
 
 
-def test_a_context_that_is_shut_down_ends_the_loop(on_either):
-    on_either.node.create_timer(0.01, on_either.context.try_shutdown)
-    with pytest.raises(ExternalShutdownException):
-        on_either.spin(lambda: False)
-
-
 # --- What survives a move
 
 
@@ -272,8 +245,21 @@ def test_no_message_request_or_response_is_lost_by_moves(served):
             # Some are handled before the move.
             served.executor.spin_once(timeout_sec=0.0)
         served.move()
+        if number % 5 == 0:
+            # The middleware does not announce again what it has announced before.
+            served.move()
         served.spin(lambda: (len(answers), len(served.received)) == (number, 3 * number))  # noqa: B023
     assert served.received == [str(number) for number in range(54)]
+
+
+def test_a_coroutine_that_waits_on_the_left_executor_ends(served):
+    future, done = served.await_future()
+    served.executor.spin_once(timeout_sec=0.01)
+    served.move()
+    served.executor.spin_once(timeout_sec=0.01)
+    future.set_result('done')
+    served.spin(lambda: done)
+    assert done == ['done']
 
 
 def test_a_message_for_the_executor_that_was_left_is_received_at_once(on_either):
@@ -295,15 +281,6 @@ def test_timers_keep_the_time_of_their_next_expiry(on_either):
     after = [timer.time_until_next_call() for timer in timers]
     assert all(left <= earlier for left, earlier in zip(after, before, strict=True))
     on_either.spin(lambda: len(ticks) == 3)
-
-
-def test_a_coroutine_that_waits_on_the_left_executor_ends(served):
-    future, done = served.await_future()
-    served.executor.spin_once(timeout_sec=0.01)
-    served.move()
-    served.executor.spin_once(timeout_sec=0.01)
-    future.set_result('done')
-    served.spin(lambda: done)
 
 
 def test_nodes_and_entities_that_are_created_after_a_move_are_executed(on_either):

@@ -168,14 +168,6 @@ def test_every_response_to_a_request_is_counted(ros):
 # --- Time
 
 
-def test_time_reader_returns_the_time_of_the_clock(lockstep):
-    read = internals.time_reader(lockstep.node.get_clock())
-    for step in (lockstep.run_for, lockstep.jump):
-        assert read() == lockstep.now == lockstep.node.get_clock().now().nanoseconds
-        step(0.1)
-    assert read() == lockstep.now
-
-
 def test_sleep_is_wrapped_once_and_called_by_sleep_for():
     clock, slept = Clock(), []
     for _ in range(2):
@@ -371,18 +363,6 @@ def test_events_executor_runs_a_task_after_the_queued_events(events, node):
     assert order == ['message', 'task']
 
 
-def test_events_executor_releases_nodes_at_shutdown_and_can_be_used_again(events, single, node):
-    received = []
-    node.create_subscription(String, 'words', received.append, 10)
-    publisher = node.create_publisher(String, 'words', 10)
-    for number, current in enumerate((events, single, events)):
-        events.shutdown()
-        publisher.publish(String(data=str(number)))
-        current.add_node(node)
-        spin(current, lambda: len(received) > number)  # noqa: B023
-    assert [message.data for message in received] == ['0', '1', '2']
-
-
 def test_ready_callbacks_are_executed_in_rounds(single, node):
     received, rounds = [], []
     publishers = []
@@ -441,14 +421,6 @@ def test_endpoints_without_an_executor(ros, monkeypatch):
     internals.send_response(service, SetBool.Response(message='on'), request_id)
     taken, response = internals.take_response(client)
     assert (taken, response.message) == (number, 'on')
-
-
-def test_tasks_that_are_not_done_are_detected(single):
-    assert not internals.has_tasks(single)
-    task = single.create_task(lambda: None)
-    assert internals.has_tasks(single)
-    spin(single, task.done)
-    assert not internals.has_tasks(single)
 
 
 def test_a_task_runs_to_the_next_await_when_it_is_called(ros):
