@@ -7,12 +7,12 @@ import random
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import Topics, change, make
-from support.ros_messages import instants, pose_of, twist, twists
+from support.ros_messages import instants, pose_of, twist, twist_stamped, twists
 
 from diffdrive_jacobian.control import VelocityLimits
 from diffdrive_jacobian.faults.robot import (
@@ -233,6 +233,18 @@ def test_a_lagging_robot_is_seen_in_its_odometry_and_commands(lockstep, robot_at
     # cmd_vel_out has the targets.
     assert [one.twist.linear.x for one in topics.applied][-2:] == [0.2, 0.0]
     assert np.diff(instants(topics.applied))[-1] == SECOND // 2
+
+
+def test_a_stamped_command_is_obeyed_while_the_robot_lags(lockstep, robot_at):
+    robot_at(enable_stamped_cmd_vel=True)
+    topics = Topics(lockstep, command=TwistStamped)
+    lockstep.inject(ActuatorLag(0.3))
+    for v in (0.2, -0.2):
+        lockstep.publish('cmd_vel', twist_stamped(v, 0.0, max(SECOND, lockstep.now - 30_000_000)))
+        lockstep.run_for(0.1)
+    assert [one.twist.linear.x for one in topics.applied][-2:] == [0.2, -0.2]
+    seen = [one.twist.twist.linear.x for one in topics.odom]
+    assert seen[-1] < max(seen) < 0.1
 
 
 def test_coarse_encoders_in_a_world(lockstep, robot_at):

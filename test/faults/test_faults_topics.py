@@ -69,15 +69,18 @@ def test_a_burst_loses_messages_in_a_row(lockstep):
     assert all(gap % 4 == 0 for gap in gaps)
 
 
-def test_a_random_delay_keeps_the_order_also_after_its_end(lockstep):
+def test_a_random_delay_keeps_the_order_also_after_its_end_and_reordering_does_not(lockstep):
     got = play(lockstep, faults.Delay('count', 0.0, spread=0.5, duration=0.75), seconds=2.0, seed=4)
     assert [number for number, _ in got] == list(range(1, 21))
-    times = [time for _, time in got]
-    assert times == sorted(times)
     late = [time - 100.0 * number for number, time in got]
     assert all(0.0 <= one <= 500.0 for one in late)
     assert late[7] > 0.0, 'the first message after the fault does not overtake'
     assert late[-8:] == [0.0] * 8
+    del got[:]
+    lockstep.inject(faults.Reorder('count', 0.3, 0.15), seed=1)
+    lockstep.run_for(2.0)
+    assert {time - 100.0 * number for number, time in got} == {0.0, 150.0}
+    assert {number for number, _ in got} >= set(range(21, 39))
 
 
 def test_a_delay_ends_when_its_last_message_has_arrived(lockstep):
@@ -98,16 +101,6 @@ def test_a_delay_ends_when_its_last_message_has_arrived(lockstep):
         (1.4, f'ends: {total}'),
     ]
     assert f'{delay!r}: ended, {total}' in lockstep.report()
-
-
-def test_reordered_messages_are_overtaken(lockstep):
-    got = play(lockstep, faults.Reorder('count', 0.3, 0.15), seconds=2.0, seed=1)
-    late = {number for number, time in got if time == 100.0 * number + 150.0}
-    punctual = {number for number, time in got if time == 100.0 * number}
-    assert late
-    assert punctual
-    assert late | punctual >= set(range(1, 20))
-    assert [number for number, _ in got] != sorted(number for number, _ in got)
 
 
 def test_a_copy_arrives_before_what_is_published_after_it(lockstep):
@@ -184,16 +177,6 @@ def test_raw_subscriptions_and_those_with_info_are_affected(lockstep):
     assert [type(one) for one in raw] == [bytes, bytes]
     assert [message.data for message, _ in infos] == [5, 5]
     assert 'source_timestamp' in infos[0][1]
-
-
-def test_what_is_under_way_to_a_removed_node_is_lost(lockstep):
-    sink = lockstep.add(Sink())
-    lockstep.inject(faults.Delay('count', 0.5))
-    lockstep.add(Source())
-    lockstep.run_for(0.3)
-    lockstep.remove(sink)
-    lockstep.run_for(1.0)
-    assert sink.received == []
 
 
 # --- Events and errors

@@ -172,7 +172,8 @@ def record_until(bag, messages, *arguments):
 
 
 def test_options_select_topics_and_storage(world, tmp_path):
-    # Latched, so that they are received whenever the recorder comes.
+    # Latched, so that they are received whenever the recorder comes, also beside others that are not.
+    world.harness.peer.create_publisher(String, 'some', 10)
     talk = Talk(world, *((topic, String, LATCHED) for topic in ('some', 'other', '_hidden')))
     for topic in talk.publishers:
         talk.say(topic, String(data=topic))

@@ -261,15 +261,6 @@ def test_after_a_burst_late_messages_are_waited_for(doubt, monkeypatch):
     assert doubt.sink.left_out == {}
 
 
-def test_without_a_burst_nothing_is_waited_for(ros, monkeypatch):
-    monkeypatch.setattr(recorder, 'HEARTBEAT', 1e6)
-    setting = Setting(ros, {})
-    setting.send(20)
-    setting.until_recorded(20)
-    setting.until_drained()
-    assert setting.sink.left_out == {}
-
-
 def test_a_best_effort_publisher_is_waited_for_only_if_the_recorder_was_held(ros, monkeypatch):
     doubt = Doubt(ros, monkeypatch, BEST_EFFORT)
     doubt.end()
@@ -466,23 +457,6 @@ def test_a_latched_message_is_recorded_once_beside_another_publisher(ros, latche
     assert (setting.sink.missed, setting.sink.left_out) == ({}, {})
 
 
-@pytest.mark.parametrize(
-    ('selection', 'expected', 'missing'),
-    [
-        ({'topics': (), 'everything': True}, {'/cmd_vel', '/other', '/rosout'}, []),
-        ({'topics': (), 'pattern': '/oth.*'}, {'/other'}, []),
-        ({'topics': ('cmd_vel', 'typo')}, {'/cmd_vel'}, ['/typo']),
-    ],
-)
-def test_topics_are_selected(ros, selection, expected, missing):
-    for topic in ('cmd_vel', 'other', '_hidden'):
-        ros.peer.create_publisher(Twist, topic, 10)
-    setting = Setting(ros, selection=Selection(**selection))
-    setting.until(lambda: expected <= set(setting.recorder.topics))
-    assert set(setting.recorder.topics) - expected <= {'/parameter_events'}
-    assert setting.recorder.missing == missing
-
-
 def test_a_middleware_without_events_is_recorded_from(ros, monkeypatch):
     create = Recorder.create_subscription
 
@@ -504,24 +478,6 @@ def test_the_time_of_a_message_is_that_of_its_receipt_or_of_the_simulated_clock(
     setting.send(1)
     setting.until_recorded(1)
     assert (setting.sink.stamps == [5]) == simulated
-
-
-def test_what_another_process_latched_is_recorded_beside_a_publisher_that_is_not_latched(
-    local_discovery, ros
-):
-    setting = Setting(ros, {})
-    with ros_context(['other']) as context:
-        # As in another process, a new publisher knows no subscription.
-        other = Node('other', context=context)
-        latched = other.create_publisher(Twist, 'cmd_vel', QoSProfile(**LATCHED))
-        setting.publishers.append(latched)
-        setting.send(1, publisher=1)
-        setting.until(latched.get_subscription_count)
-        setting.send(1, publisher=1)
-        setting.send(1, publisher=0)
-        setting.until_recorded(3)
-        other.destroy_node()
-    assert sorted(setting.sink.data) == sorted(setting.sent)
 
 
 def test_publishers_of_another_type_are_reported(local_discovery, ros):

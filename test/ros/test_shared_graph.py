@@ -7,7 +7,7 @@ import weakref
 from collections import Counter
 
 import pytest
-from geometry_msgs.msg import Twist, TwistStamped
+from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -138,18 +138,6 @@ def test_without_the_signal_of_rcl_every_check_queries(monkeypatch, create, quer
         check(create(VirtualRobot, 'a'), times=3)
     rclpy_internals._graph_functions.cache_clear()
     assert queries['count_publishers', '/a/odom'] == 3
-
-
-def test_an_idle_driver_that_came_later_is_found(create, queries):
-    controller, other = create(GoToGoal, 'a'), create(Node, 'other')
-    drivers = controller._others
-    drivers.start()
-    for second in range(1, 4):
-        drivers.search(second * 1_000_000_000)
-    assert queries['count_publishers', '/a/cmd_vel'] == 1
-    other.create_publisher(Twist, '/a/cmd_vel', 1)
-    drivers.start()
-    assert drivers.subscriptions == 1
 
 
 def test_other_types_are_reported_once_until_they_are_gone(create, queries, capfd, monkeypatch):
