@@ -133,6 +133,11 @@ HELD = {
         [*at(550.0, 1, 2, 3, 4, 5), *in_time(6, 9)],
         [100.0, 200.0, 550.0, 600.0, 700.0, 800.0, 900.0],
     ),
+    'slower than its timer': (
+        [faults.Slow('relay', 0.25, duration=0.45)],
+        [(1, 100.0), *at(600.0, 2, 3, 4, 5, 6), *in_time(7, 9)],
+        [350.0, 600.0, 700.0, 800.0, 900.0],
+    ),
     # Messages and ticks are due together. The message comes first, the tick is older than the next.
     'slow': (
         [faults.Slow('relay', 0.06, duration=0.45)],
@@ -275,8 +280,11 @@ def test_a_refused_value_is_an_event_and_an_unknown_parameter_an_error(lockstep,
     lockstep.inject(faults.ParameterChange('relay', 'gain', 'high'))
     assert whats(lockstep)[1].startswith("gain = 'high' is refused: ")
     assert relay.get_parameter('gain').value == 1.0
+    lockstep.inject(faults.ParameterChange('other', 'gain', 3.0))
+    assert whats(lockstep)[2:] == ['begins', 'the node is not there']
     with pytest.raises(LockstepError, match="/relay has no parameter 'kp'; it has gain"):
         lockstep.inject(faults.ParameterChange('relay', 'kp', 1.0))
+    lockstep.close()
 
 
 def test_node_faults_that_met_no_node_are_errors(lockstep):
