@@ -274,12 +274,11 @@ def test_a_message_for_the_executor_that_was_left_is_received_at_once(on_either)
 
 def test_timers_keep_the_time_of_their_next_expiry(on_either):
     ticks = []
-    timers = [on_either.node.create_timer(period, lambda: ticks.append(1)) for period in (30.0, 0.02)]
+    slow, _ = (on_either.node.create_timer(period, lambda: ticks.append(1)) for period in (30.0, 0.02))
     on_either.spin(lambda: ticks)
-    before = [timer.time_until_next_call() for timer in timers]
+    before = slow.time_until_next_call()
     on_either.move()
-    after = [timer.time_until_next_call() for timer in timers]
-    assert all(left <= earlier for left, earlier in zip(after, before, strict=True))
+    assert slow.time_until_next_call() <= before
     on_either.spin(lambda: len(ticks) == 3)
 
 
