@@ -1,8 +1,9 @@
 """Adapter to the parts of rclpy that are not public, or whose behaviour is not documented.
 
 No other module imports from `rclpy.impl` or `rclpy.experimental`, or accesses a private attribute of an
-object of rclpy. Each function names what it relies on. `test/ros/test_rclpy_internals.py` has a test for
-each, so that a release of rclpy that differs fails there first. Tried with rclpy 7.1.6 (Jazzy).
+object of rclpy. Each function names what it relies on. A release of rclpy that differs fails first in
+`test/ros/test_rclpy_internals.py`, `test/lockstep` or `test/recording/test_recorder.py`. Tried with
+rclpy 7.1.6 (Jazzy).
 
 `lockstep._scheduler` and `lockstep._services` also rely on how the EventsExecutor accesses nodes.
 """

@@ -78,6 +78,11 @@ def play(world, *injected, seconds=1.0, seed=0, profile=10):
     return sink.received
 
 
+def in_time(first, last, late=0.0):
+    """Return the messages from the first to the last, with their times (ms)."""
+    return [(number, 100.0 * number + late) for number in range(first, last + 1)]
+
+
 def whats(world):
     """Return the texts of the events."""
     return [event.what for event in world.fault_events]

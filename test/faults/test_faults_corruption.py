@@ -56,10 +56,8 @@ Y = 'pose.pose.position.y'
 CHANGED = [
     (Y, 'nan', None, math.nan),
     (Y, 'inf', None, math.inf),
-    (Y, '-inf', None, -math.inf),
     (Y, 'negate', None, 2.0),
     (Y, 'offset', 0.25, -1.75),
-    (Y, 'offset', -3, -5.0),
     (Y, 'scale', -10.0, 20.0),
     (Y, 'scale', 1.7e308, -math.inf),
     (Y, 'set', 7, 7.0),
@@ -67,14 +65,11 @@ CHANGED = [
     ('header.frame_id', 'set', 'a frame that is longer', 'a frame that is longer'),
     # A stamp is shifted in seconds, within what it can represent.
     ('header.stamp', 'offset', -2.5, Time(sec=9, nanosec=750_000_000)),
-    ('header.stamp', 'offset', 0.75, Time(sec=13)),
     ('header.stamp', 'offset', -20.0, Time(sec=-8, nanosec=250_000_000)),
     ('header.stamp', 'offset', 1e300, Time(sec=2**31 - 1, nanosec=SECOND - 1)),
     ('header.stamp', 'offset', -1e300, Time(sec=-(2**31))),
-    ('header.stamp', 'set', 0.0, Time()),
     ('header.stamp', 'set', -0.5, Time(sec=-1, nanosec=500_000_000)),
     # One that makes no sense is possible, too.
-    ('header.stamp.sec', 'set', -3, -3),
     ('header.stamp.nanosec', 'set', 2**32 - 1, 2**32 - 1),
 ]
 
@@ -101,12 +96,9 @@ def test_a_float_of_single_precision_gets_its_own_subnormal_and_overflows_at_its
     [
         (Int8(data=100), 'offset', 50, 127),
         (Int8(data=-128), 'negate', 0.0, 127),
-        (Int8(data=100), 'negate', 0.0, -100),
         (Int8(data=5), 'scale', 0.5, 2),
         (Int64(data=2), 'scale', 1e300, 2**63 - 1),
-        (Int64(data=0), 'set', 2**63 - 1, 2**63 - 1),
         (UInt8(data=5), 'offset', -9.0, 0),
-        (UInt8(data=5), 'scale', -1.0, 0),
         (Bool(data=True), 'negate', 0.0, False),
         (Bool(data=False), 'set', True, True),
         (String(data='odom'), 'set', 'map', 'map'),
@@ -136,10 +128,8 @@ def test_elements_and_whole_arrays_of_both_kinds():
 
 
 def test_elements_that_are_messages_also_in_bounded_sequences():
-    sent = Path(poses=[PoseStamped(), PoseStamped()])
-    received = corrupted(sent, 'poses[1].pose.position.x', 'set', 4.0)
-    assert [one.pose.position.x for one in received.poses] == [0.0, 4.0]
-    assert corrupted(sent, 'poses[0].header.stamp', 'set', 2.0).poses[0].header.stamp.sec == 2
+    received = corrupted(Path(poses=[PoseStamped(), PoseStamped()]), 'poses[1].header.stamp', 'set', 4.0)
+    assert [one.header.stamp.sec for one in received.poses] == [0, 4]
     bounded = ParameterDescriptor(floating_point_range=[FloatingPointRange(to_value=1.0)])
     received = corrupted(bounded, 'floating_point_range[0].to_value', 'nan')
     assert math.isnan(received.floating_point_range[0].to_value)
@@ -147,24 +137,18 @@ def test_elements_that_are_messages_also_in_bounded_sequences():
     assert corrupted(flags, 'bool_array_value', 'negate').bool_array_value == [False, True]
 
 
-@pytest.mark.parametrize(
-    ('message', 'path'),
-    [
-        (JointState(velocity=[1.0]), 'velocity[1]'),
-        (JointState(), 'velocity'),
-        (Path(), 'poses[0].pose.position.x'),
-    ],
-)
-def test_a_message_without_the_element_arrives_as_it_was(message, path):
-    received, same = through(message, path, 'nan')
-    assert same
-    assert received == message
-
-
-def test_a_change_that_changes_nothing_leaves_the_bytes_alone():
+def test_a_message_that_is_not_changed_keeps_its_bytes():
     """A receiver that compares bytes does not see another message."""
-    assert through(drive(), 'pose.pose.position.x', 'scale', 1.0)[1]
-    assert through(drive(), 'header.stamp', 'offset', 0.0)[1]
+    for message, *change in (
+        (JointState(velocity=[1.0]), 'velocity[1]', 'nan'),
+        (JointState(), 'velocity', 'nan'),
+        (Path(), 'poses[0].pose.position.x', 'nan'),
+        (drive(), 'pose.pose.position.x', 'scale', 1.0),
+        (drive(), 'header.stamp', 'offset', 0.0),
+    ):
+        received, same = through(message, *change)
+        assert same
+        assert received == message
     assert not through(drive(0.0), 'pose.pose.position.x', 'negate')[1]
 
 
@@ -197,12 +181,10 @@ def test_the_share_of_changed_messages_and_which_ones_follow_from_the_seed():
     ('path', 'told'),
     [
         ('pose.x', "geometry_msgs/PoseWithCovariance has no 'x'; its fields: pose, covariance"),
-        ('speed', "nav_msgs/Odometry has no 'speed'; its fields: header, child_frame_id, pose, twist"),
         ('header.stamp.sec.x', "int32 has no 'x'; its fields: none"),
         ('pose.covariance[36]', "'covariance' has 36 elements"),
         ('pose[0].pose', "'pose' has a single value"),
         ('pose.covariance.x', "double[36] has no 'x'; its fields: elements [0], [1], ..."),
-        ('pose..pose', "has no ''"),
         ('pose.covariance[-1]', "has no 'covariance[-1]'"),
         ('pose.__class__', "has no '__class__'"),
     ],
@@ -213,45 +195,34 @@ def test_a_field_that_does_not_exist_names_those_that_do(path, told):
     assert told in message
 
 
+INTEGERS = "it must be 'negate', 'offset', 'scale' or 'set', with integers from -128"
+NO_NUMBER = 'name one of its fields that is a number'
+
+
 @pytest.mark.parametrize(
     ('message_type', 'path', 'change', 'told'),
     [
-        (
-            Int8,
-            'data',
-            ('nan',),
-            "it must be 'negate', 'offset', 'scale' or 'set', with integers from -128",
-        ),
-        (
-            UInt8,
-            'data',
-            ('negate',),
-            "it must be 'offset', 'scale' or 'set', with integers from 0 to 255",
-        ),
+        (Int8, 'data', ('nan',), INTEGERS),
+        (Int8, 'data', ('offset', 0.5), INTEGERS),
+        (Int8, 'data', ('set', True), INTEGERS),
+        (UInt8, 'data', ('negate',), "'offset', 'scale' or 'set', with integers from 0 to 255"),
         (UInt8, 'data', ('set', 256), 'integers from 0 to 255'),
-        (Int8, 'data', ('offset', 0.5), 'integers from -128 to 127'),
-        (Int8, 'data', ('set', True), 'integers from -128 to 127'),
-        (String, 'data', ('nan',), "it must be 'set' with a str"),
         (String, 'data', ('set', 1.0), "it must be 'set' with a str"),
         (Bool, 'data', ('offset', 1.0), "it must be 'negate', or 'set' with a bool"),
-        (Odometry, 'header.stamp', ('nan',), "'offset' or 'set', with a number of seconds"),
         (Odometry, 'header.stamp', ('scale', 2.0), "'offset' or 'set', with a number of seconds"),
         (Odometry, 'pose.pose.position.x', ('set', 'map'), 'with a number as amount'),
-        (Odometry, 'pose.pose', ('nan',), 'name one of its fields that is a number'),
-        (Path, 'poses', ('nan',), 'name one of its fields that is a number'),
-        (Byte, 'data', ('set', 1), 'name one of its fields that is a number'),
+        (Odometry, 'pose.pose', ('nan',), NO_NUMBER),
+        (Path, 'poses', ('nan',), NO_NUMBER),
+        (Byte, 'data', ('set', 1), NO_NUMBER),
+        (Empty, 'data', ('nan',), "has no 'data'"),
     ],
 )
 def test_a_change_that_the_type_does_not_allow_is_refused_with_those_that_it_does(
     message_type, path, change, told
 ):
     message = refused(message_type, path, *change)
-    assert f"is not possible for field '{path}'" in message
+    assert f"field '{path}'" in message
     assert told in message
-
-
-def test_a_type_without_fields():
-    assert "has no 'data'" in refused(Empty, 'data', 'nan')
 
 
 # --- In a world

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,18 +61,6 @@ def close(pose, expected, tolerance=1e-12):
 # --- Motors, as values
 
 
-@pytest.mark.parametrize(('wheel', 'side'), [('left', 1.0), ('right', -1.0)])
-def test_a_dead_motor_turns_the_robot_about_its_wheel(wheel, side):
-    """The other wheel keeps its speed v / r: omega is v / L, about the point y = L / 2 or -L / 2."""
-    v, seconds = 0.2, 1.7
-    robot = at_rest(actuators=Actuators(**{f'max_{wheel}_speed': 0.0})).commanded((v, 0.0), 0)
-    assert robot.twist == pytest.approx((v / 2.0, side * v / L))
-    turn = side * v / L * seconds
-    centre = compose(START, (0.0, side * L / 2.0, 0.0))
-    expected = compose(compose(centre, (0.0, 0.0, turn)), (0.0, -side * L / 2.0, 0.0))
-    close(robot.at(round(seconds * SECOND)).pose, expected)
-
-
 def test_a_weak_motor_limits_its_own_wheel_after_the_limits_of_the_robot():
     limits = VelocityLimits(max_v=0.3)
     robot = at_rest(limits=limits, actuators=Actuators(max_right_speed=2.0)).commanded((5.0, 0.0), 0)
@@ -100,7 +87,7 @@ class LaggingWheel:
 
 def test_wheels_approach_random_commands_with_their_lag_until_the_timeout():
     chance, timeout = random.Random(1), 0.5
-    for _ in range(30):
+    for _ in range(10):
         tau, most = 10.0 ** chance.uniform(-3.0, 0.3), [chance.choice([math.inf, 5.0, 0.0]), 4.0]
         wheels = [LaggingWheel(tau, one) for one in most]
         actuators = Actuators(lag=tau, max_right_speed=most[0], max_left_speed=most[1])
@@ -131,36 +118,6 @@ def test_a_lagging_robot_reaches_the_command_and_is_then_an_ordinary_one():
         robot.at(SECOND).at(SECOND - 1)
 
 
-def test_a_motor_that_dies_while_it_lags_runs_out():
-    tau = 0.1
-    moving = lagging(tau).commanded((0.2, 0.0), 0).at(5 * SECOND)
-    dead = replace(moving.model, actuators=Actuators(lag=tau, max_right_speed=0.0))
-    robot = moving.remodelled(dead, 5 * SECOND)
-    turned = robot.at(5 * SECOND + SECOND // 10).wheel_angles[0] - robot.wheel_angles[0]
-    assert turned == pytest.approx(0.2 / R * tau * (1.0 - math.exp(-0.1 / tau)), rel=1e-4)
-    end = robot.at(15 * SECOND)
-    assert end.settles_at == end.stamp
-    assert end.wheel_speeds == pytest.approx((0.0, 0.2 / R))
-
-
-def test_without_effect_actuators_change_no_bit():
-    plain, same = at_rest(), at_rest(actuators=Actuators())
-    for stamp, command in ((0, (0.2, 0.3)), (SECOND, (0.0, -1.0)), (2 * SECOND, (0.0, 0.0))):
-        plain, same = plain.commanded(command, stamp), same.commanded(command, stamp)
-        later = stamp + SECOND // 3
-        assert plain.at(later).pose_tuple == same.at(later).pose_tuple
-        assert plain.at(later).covariance_tuple == same.at(later).covariance_tuple
-
-
-def test_actuators_refuse_what_is_no_speed_and_no_time():
-    for name in ('max_left_speed', 'max_right_speed', 'lag'):
-        for value in (-1.0, math.nan, 'x'):
-            with pytest.raises(ValueError, match=name):
-                Actuators(**{name: value})
-    with pytest.raises(ValueError, match='actuators'):
-        RobotModel(actuators=3.0)
-
-
 # --- Encoders, as values
 
 
@@ -170,7 +127,7 @@ def test_odometry_of_coarse_encoders_stays_within_their_increment_of_the_truth()
     robot = first = at_rest().commanded((0.3, 1.0), 0).at(SECOND // 7)
     start = np.floor(np.array(first.wheel_angles) / increment) * increment
     encoders, distance, worst = Encoders.at(first, 20), 0.0, 0.0
-    for v, omega in rng.normal(0.0, [0.3, 2.0], (100, 2)):
+    for v, omega in rng.normal(0.0, [0.3, 2.0], (40, 2)):
         robot = robot.commanded((v, omega), robot.stamp)
         for _ in range(3):
             robot = robot.at(robot.stamp + SECOND // 50)
@@ -229,7 +186,6 @@ def test_a_push_is_a_motion_in_the_body_frame(noticed):
 def test_a_push_that_the_odometry_does_not_notice_needs_a_truth():
     with pytest.raises(ValueError, match='model must have a drift'):
         at_rest().pushed((0.1, 0.0, 0.0), 0)
-    close(at_rest().pushed((0.1, 0.0, 0.0), 0, noticed=True).pose, compose(START, (0.1, 0.0, 0.0)))
 
 
 # --- In a world
@@ -247,27 +203,22 @@ def measured(topics):
 def test_a_motor_dies_under_a_command_that_is_held_and_lives_again(lockstep, robot_at):
     robot = robot_at(cmd_vel_timeout=0.0)
     topics = Topics(lockstep)
-    lockstep.inject(DeadWheel('left', start=1.0, duration=0.5))
+    lockstep.inject(DeadWheel('left', start=0.5, duration=0.5))
     drive(lockstep)
-    lockstep.run_for(2.0)
-    expected_twists = [(0.2, 0.0), (0.1, 0.2 / L), (0.2, 0.0)]
-    np.testing.assert_allclose(twists(topics.applied), expected_twists, atol=1e-12)
-    assert instants(topics.applied) == [SECOND, 2 * SECOND, 5 * SECOND // 2]
-    turned = 0.2 / L * 0.5
-    expected = compose(
-        integrate(integrate((0.0, 0.0, 0.0), (0.2, 0.0), 1.0), (0.1, 0.2 / L), 0.5), (0.1, 0.0, 0.0)
+    lockstep.run_for(1.5)
+    np.testing.assert_allclose(
+        twists(topics.applied), [(0.2, 0.0), (0.1, 0.2 / L), (0.2, 0.0)], atol=1e-12
     )
+    assert instants(topics.applied) == [SECOND, 3 * SECOND // 2, 2 * SECOND]
+    expected = compose(integrate((0.1, 0.0, 0.0), (0.1, 0.2 / L), 0.5), (0.1, 0.0, 0.0))
     close(pose_of(topics.odom[-1]), expected, 1e-9)
     close(robot.truth, expected, 1e-9)
-    assert expected[2] == pytest.approx(turned)
-    left, right = topics.states[-1].position
-    assert left == pytest.approx(0.2 / R * 1.5)
-    assert right == pytest.approx(0.2 / R * 2.0)
+    assert topics.states[-1].position.tolist() == pytest.approx([0.2 / R, 0.2 / R * 1.5])
     assert [event.what for event in lockstep.fault_events] == ['begins', 'ends']
 
 
 def test_a_lagging_robot_is_seen_in_its_odometry_and_commands(lockstep, robot_at):
-    tau = 0.1
+    tau = 0.05
     robot_at(publish_rate=50.0)
     topics = Topics(lockstep)
     lockstep.inject(ActuatorLag(tau))
@@ -277,11 +228,8 @@ def test_a_lagging_robot_is_seen_in_its_odometry_and_commands(lockstep, robot_at
     travelled = 0.2 * reached(tau, (lockstep.now - began) / SECOND)
     assert topics.odom[-1].pose.pose.position.x == pytest.approx(travelled, rel=1e-9)
     # Its timeout of 0.5 s is one of the commands, not of the steps.
-    lockstep.run_for(0.1)
-    assert topics.odom[-1].pose.pose.position.x == pytest.approx(0.2 * reached(tau, 0.5), rel=1e-9)
-    lockstep.run_for(3.0)
+    lockstep.run_for(0.6)
     assert topics.odom[-1].pose.pose.position.x == pytest.approx(0.2 * 0.5, abs=1e-4)
-    assert measured(topics) == pytest.approx((0.0, 0.0), abs=1e-9)
     # cmd_vel_out has the targets.
     assert [one.twist.linear.x for one in topics.applied][-2:] == [0.2, 0.0]
     assert np.diff(instants(topics.applied))[-1] == SECOND // 2
@@ -296,39 +244,33 @@ def test_a_stamped_command_is_obeyed_while_the_robot_lags(lockstep, robot_at):
         lockstep.run_for(0.1)
     assert [one.twist.linear.x for one in topics.applied][-2:] == [0.2, -0.2]
     seen = [one.twist.twist.linear.x for one in topics.odom]
-    assert max(seen) < 0.1
-    assert seen[-1] < max(seen)
+    assert seen[-1] < max(seen) < 0.1
 
 
 def test_coarse_encoders_in_a_world(lockstep, robot_at):
-    robot = robot_at()
+    robot = robot_at(cmd_vel_timeout=0.0)
     topics = Topics(lockstep)
     truths = lockstep.listen(Odometry, 'ground_truth')
-    lockstep.inject(EncoderSteps(16, start=0.2, duration=1.0))
+    lockstep.inject(EncoderSteps(16, start=0.2, duration=0.5))
     increment = math.tau / 16
-    for _ in range(7):
-        drive(lockstep, 0.2, 1.0)
-        lockstep.run_for(0.2)
-        close(robot.pose, pose_of(topics.odom[-1]))
-        apart = math.dist(robot.pose[:2], robot.truth[:2])
-        assert apart < 2.0 * R * increment * (1.0 + 0.3 / L)
-    exact = integrate((0.0, 0.0, 0.0), (0.2, 1.0), 1.4)
+    drive(lockstep, 0.2, 1.0)
+    lockstep.run_for(0.9)
+    exact = integrate((0.0, 0.0, 0.0), (0.2, 1.0), 0.9)
     close(robot.truth, exact, 1e-9)
     close(pose_of(truths[-1]), exact, 1e-9)
-    np.testing.assert_allclose(twists(one.twist for one in truths), [(0.2, 1.0)] * len(truths))
+    close(robot.pose, pose_of(topics.odom[-1]))
+    assert 1e-4 < math.dist(robot.pose[:2], exact[:2]) < 2.0 * R * increment * (1.0 + 0.3 / L)
     # During the fault the angles are whole increments, and the twist is what was counted.
-    during = slice(*np.searchsorted(instants(topics.states), [13 * SECOND // 10, 21 * SECOND // 10]))
-    counted = topics.states[during]
-    angles = np.array([one.position for one in counted]) / increment
+    during = slice(*np.searchsorted(instants(topics.states), [13 * SECOND // 10, 16 * SECOND // 10]))
+    angles = np.array([one.position for one in topics.states[during]]) / increment
     assert np.abs(angles - np.round(angles)).max() < 1e-9
-    assert len(set(angles[:, 0])) > 3
-    velocities = np.array([one.velocity for one in counted])[1:]
+    assert len(set(angles[:, 0])) > 2
+    velocities = np.array([one.velocity for one in topics.states[during]])[1:]
     np.testing.assert_allclose(velocities, np.diff(angles, axis=0) * increment * 50.0, atol=1e-9)
     # Afterwards the odometry goes on from where it was.
     jumps = np.diff([pose_of(one)[:2] for one in topics.odom], axis=0)
     assert np.hypot(*jumps.T).max() < R * increment + 0.2 / 50.0
     assert len(topics.starts) == 1
-    assert math.dist(pose_of(topics.odom[-1])[:2], exact[:2]) > 1e-4
 
 
 def test_coarse_odometry_can_be_reset(lockstep, robot_at):
@@ -352,29 +294,24 @@ def test_a_push_moves_the_robot_and_its_odometry_only_if_it_is_noticed(lockstep,
     topics = Topics(lockstep)
     truths = lockstep.listen(Odometry, 'ground_truth')
     starts = lockstep.listen(PoseWithCovarianceStamped, 'start_pose')
-    lockstep.inject(Push(0.1, 0.2, 0.3, start=0.5, noticed=noticed))
-    lockstep.run_for(0.4)
-    close(robot.truth, (1.0, 0.0, math.pi / 2.0))
+    lockstep.inject(Push(0.1, 0.2, 0.3, start=0.1, noticed=noticed))
     lockstep.run_for(0.2)
     assert [(event.time_ns, event.what) for event in lockstep.fault_events] == [
-        (500_000_000, 'begins'),
-        (500_000_000, 'ends'),
+        (100_000_000, 'begins'),
+        (100_000_000, 'ends'),
     ]
     moved = (0.8, 0.1, math.pi / 2.0 + 0.3)
     close(robot.truth, moved)
     close(pose_of(topics.odom[-1]), moved if noticed else (1.0, 0.0, math.pi / 2.0))
-    assert len(starts) == noticed
-    if noticed:
-        close(pose_of(starts[-1]), moved)
-        assert not truths
-        return
-    close(pose_of(truths[-1]), moved)
+    assert (len(starts), bool(truths)) == (noticed, not noticed)
+    close(pose_of((starts or truths)[-1]), moved)
     # A reset is one of the odometry alone.
     lockstep.call(Trigger, 'reset_odometry')
     drive(lockstep)
     lockstep.run_for(0.1)
-    close(robot.truth, compose(moved, (0.02, 0.0, 0.0)), 1e-9)
-    close(pose_of(topics.odom[-1]), (1.0, 0.02, math.pi / 2.0), 1e-9)
+    if not noticed:
+        close(robot.truth, compose(moved, (0.02, 0.0, 0.0)), 1e-9)
+        close(pose_of(topics.odom[-1]), (1.0, 0.02, math.pi / 2.0), 1e-9)
 
 
 def test_slip_and_wrong_geometry_for_a_time_are_seen_by_the_truth_alone(lockstep, robot_at):
@@ -395,11 +332,11 @@ def test_the_slip_follows_from_the_seed_of_the_injection(lockstep, robot_at):
     names = ('/a', '/b', '/c')
     robots = [robot_at(namespace=name) for name in names]
     for name, seed in zip(names, (1, 1, 2), strict=True):
-        lockstep.inject(Slip(robot=f'{name}/virtual_robot', duration=0.3), seed=seed)
+        lockstep.inject(Slip(robot=f'{name}/virtual_robot', duration=0.1), seed=seed)
         drive(lockstep, topic=f'{name}/cmd_vel')
-    lockstep.run_for(0.3)
+    lockstep.run_for(0.1)
     first = [robot.truth for robot in robots]
-    assert all(np.abs(one - (0.06, 0.0, 0.0)).max() > 1e-6 for one in first)
+    assert all(np.abs(one - (0.02, 0.0, 0.0)).max() > 1e-6 for one in first)
     assert len({tuple(one) for one in first}) == 3
     lockstep.run_for(0.1)
     for robot, before in zip(robots, first, strict=True):
@@ -438,36 +375,18 @@ def test_lags_count_once_and_multipliers_multiply(lockstep, robot_at):
     assert robot.truth[2] == pytest.approx(turned / (3.0 * 0.5 * 0.5))
 
 
-def test_a_fault_applies_to_a_robot_that_is_added_later_and_again(lockstep):
-    lockstep.inject(DeadWheel('left'), Push(0.5))
+def test_a_fault_applies_to_a_robot_that_comes_later_and_again_but_pushes_it_once(lockstep):
+    lockstep.inject(DeadWheel('left'), Push(0.5), Kill('virtual_robot', start=0.2, duration=0.2))
     topics = Topics(lockstep)
+    lockstep.create(lambda: make(VirtualRobot, cmd_vel_timeout=0.0))
     for expected in (0.5, 0.0):
-        robot = lockstep.add(make(VirtualRobot))
+        robot = lockstep.find('virtual_robot')
         close(robot.truth, (expected, 0.0, 0.0))
         drive(lockstep)
         lockstep.run_for(0.1)
         assert measured(topics) == pytest.approx((0.1, 0.2 / L))
-        lockstep.remove(robot)
+        lockstep.run_for(0.3)
     lockstep.check_faults()
-
-
-def test_a_robot_that_is_killed_comes_back_with_its_fault(lockstep):
-    lockstep.create(lambda: make(VirtualRobot, cmd_vel_timeout=0.0))
-    topics = Topics(lockstep)
-    lockstep.inject(
-        DeadWheel('left', duration=1.0), Kill('virtual_robot', start=0.2, duration=0.2), Push(0.3)
-    )
-    lockstep.run_for(0.5)
-    drive(lockstep)
-    lockstep.run_for(0.1)
-    assert measured(topics) == pytest.approx((0.1, 0.2 / L))
-    lockstep.run_for(0.5)
-    assert measured(topics) == pytest.approx((0.2, 0.0))
-    # It has lost its pose.
-    robot = lockstep.find('virtual_robot')
-    turned = 0.2 / L * 0.5
-    centre = compose((0.0, L / 2.0, 0.0), (0.0, 0.0, turned))
-    close(robot.truth, compose(centre, (0.02, -L / 2.0, 0.0)), 1e-9)
 
 
 def test_a_fault_without_a_robot_is_reported_and_one_of_another_node_refused(lockstep):

@@ -23,7 +23,7 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.testing import Lockstep
 
-SCHEDULES = 4
+SCHEDULES = 3
 TOPICS = {
     'odom': Odometry,
     'cmd_vel': Twist,
@@ -58,7 +58,7 @@ def schedules():
     kinds = chance.sample(KINDS, len(KINDS))
     made = [[] for _ in range(SCHEDULES)]
     for index, kind in enumerate(kinds):
-        times = {'start': chance.uniform(0.0, 0.4), 'duration': chance.choice([0.1, 0.2, 0.5])}
+        times = {'start': chance.uniform(0.0, 0.2), 'duration': chance.choice([0.1, 0.2, 0.5])}
         if isinstance(kind, partial) or kind in (faults.Stale, faults.Kill, faults.Hang):
             of_topic = issubclass(getattr(kind, 'func', kind), faults.TopicFault)
             topics, nodes = ('odom', 'cmd_vel', 'joint_command'), ('virtual_robot', 'go_to_goal')
@@ -92,7 +92,7 @@ def drive(number):
             world.node.create_subscription(message_type, topic, partial(add, topic), 1000)
         world.inject(*schedules()[number], seed=number)
         world.publish('goal_pose', goal(2.0, 1.0))
-        world.run_for(0.6)
+        world.run_for(0.4)
         digest.update(str([str(event) for event in world.fault_events]).encode())
         digest.update(str(world.now).encode())
         return digest.hexdigest(), len(world.fault_events)
@@ -110,4 +110,3 @@ def test_random_schedules_are_the_same_each_time_also_in_another_process():
     )
     run = forked.run(program, timeout=120)
     assert run.stdout.split() == [digest for digest, _ in first], run.stderr
-    assert drive(1) == first[1]

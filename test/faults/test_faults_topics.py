@@ -6,19 +6,13 @@ import json
 from itertools import pairwise
 
 import pytest
-from faults_nodes import LATCHED, Sink, Source, play, whats
+from faults_nodes import LATCHED, Sink, Source, in_time, play
 from rclpy.node import Node
 from std_msgs.msg import Int64, String
 
 from diffdrive_jacobian import faults
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.testing import Lockstep, LockstepError
-
-
-def in_time(first, last, late=0.0):
-    """Return the messages from the first to the last, with their times (ms)."""
-    return [(number, 100.0 * number + late) for number in range(first, last + 1)]
-
 
 DELAY = faults.Delay('count', 0.3)
 LOSS = faults.Loss('count', duration=0.55)
@@ -59,32 +53,34 @@ def test_messages_arrive(lockstep, how):
 
 def test_events_name_what_has_happened_to_which_messages(lockstep):
     play(lockstep, faults.Loss('count', start=0.3, duration=0.3), faults.Stale('count', start=0.65))
-    assert whats(lockstep)[:3] == [
-        'begins',
-        'messages 3 to 5 of /count to /sink lost, from 0.3 s to 0.5 s',
-        'ends: 3 of 3 messages of /count to /sink',
+    assert [(event.time_ns / 1e9, event.what) for event in lockstep.fault_events] == [
+        (0.3, 'begins'),
+        (0.6, 'messages 3 to 5 of /count to /sink lost, from 0.3 s to 0.5 s'),
+        (0.6, 'ends: 3 of 3 messages of /count to /sink'),
+        (0.65, 'begins'),
+        (1.0, 'messages 4 to 7 of /count to /sink changed, from 0.7 s to 1 s'),
     ]
-    times = [event.time_ns for event in lockstep.fault_events]
-    assert times[:3] == [300_000_000, 600_000_000, 600_000_000]
-    assert whats(lockstep)[-1] == 'messages 4 to 7 of /count to /sink changed, from 0.7 s to 1 s'
 
 
 def test_a_burst_loses_messages_in_a_row(lockstep):
-    got = play(lockstep, faults.Loss('count', probability=0.1, burst=4), seconds=20.0)
+    got = play(lockstep, faults.Loss('count', probability=0.1, burst=4), seconds=10.0)
     gaps = [after - before - 1 for (before, _), (after, _) in pairwise(got) if after - before > 1]
-    assert len(gaps) > 5
+    assert len(gaps) > 2
     assert all(gap % 4 == 0 for gap in gaps)
 
 
-def test_a_random_delay_keeps_the_order_also_after_its_end(lockstep):
+def test_a_random_delay_keeps_the_order_also_after_its_end_and_reordering_does_not(lockstep):
     got = play(lockstep, faults.Delay('count', 0.0, spread=0.5, duration=0.75), seconds=2.0, seed=4)
     assert [number for number, _ in got] == list(range(1, 21))
-    times = [time for _, time in got]
-    assert times == sorted(times)
     late = [time - 100.0 * number for number, time in got]
     assert all(0.0 <= one <= 500.0 for one in late)
     assert late[7] > 0.0, 'the first message after the fault does not overtake'
     assert late[-8:] == [0.0] * 8
+    del got[:]
+    lockstep.inject(faults.Reorder('count', 0.3, 0.15), seed=1)
+    lockstep.run_for(2.0)
+    assert {time - 100.0 * number for number, time in got} == {0.0, 150.0}
+    assert {number for number, _ in got} >= set(range(21, 39))
 
 
 def test_a_delay_ends_when_its_last_message_has_arrived(lockstep):
@@ -105,16 +101,6 @@ def test_a_delay_ends_when_its_last_message_has_arrived(lockstep):
         (1.4, f'ends: {total}'),
     ]
     assert f'{delay!r}: ended, {total}' in lockstep.report()
-
-
-def test_reordered_messages_are_overtaken(lockstep):
-    got = play(lockstep, faults.Reorder('count', 0.3, 0.15), seconds=2.0, seed=1)
-    late = {number for number, time in got if time == 100.0 * number + 150.0}
-    punctual = {number for number, time in got if time == 100.0 * number}
-    assert late
-    assert punctual
-    assert late | punctual >= set(range(1, 20))
-    assert [number for number, _ in got] != sorted(number for number, _ in got)
 
 
 def test_a_copy_arrives_before_what_is_published_after_it(lockstep):
@@ -193,16 +179,6 @@ def test_raw_subscriptions_and_those_with_info_are_affected(lockstep):
     assert 'source_timestamp' in infos[0][1]
 
 
-def test_what_is_under_way_to_a_removed_node_is_lost(lockstep):
-    sink = lockstep.add(Sink())
-    lockstep.inject(faults.Delay('count', 0.5))
-    lockstep.add(Source())
-    lockstep.run_for(0.3)
-    lockstep.remove(sink)
-    lockstep.run_for(1.0)
-    assert sink.received == []
-
-
 # --- Events and errors
 
 
@@ -223,12 +199,6 @@ def test_events_are_published_reported_and_bounded(lockstep):
     assert 'events of faults, without the first 181:' in report
     assert "Loss('count', start=500.0): has not begun, starts at 500 s" in report
     lockstep.finish()
-
-
-def test_messages_to_a_node_that_was_started_again_are_counted_together(lockstep):
-    loss = faults.Loss('count', duration=0.45)
-    play(lockstep, loss, faults.Kill('sink', start=0.25, duration=0.1))
-    assert whats(lockstep)[-1] == 'ends: 3 of 3 messages of /count to /sink'
 
 
 def test_a_fault_that_met_nothing_is_an_error(lockstep):

@@ -28,41 +28,32 @@ INF = float('inf')
 def test_the_clock_jumps_there_and_back_while_world_time_goes_on(lockstep):
     source, sink = lockstep.create(Source), lockstep.create(Sink)
     sink.received.clear()
-    lockstep.inject(faults.TimeJump(5.0, start=0.35, duration=0.3))
+    lockstep.inject(
+        faults.TimeJump(5.0, start=0.35, duration=0.3), faults.ClockPause(start=0.8, duration=0.1)
+    )
     lockstep.run_for(1.0)
-    assert lockstep.world_time == 1_000_000_000
-    assert lockstep.elapsed == 1.0
+    assert (lockstep.elapsed, lockstep.world_time, lockstep.now) == (0.9, 10**9, 1_900_000_000)
     assert sink.received[:4] == [(1, 100.0), (2, 200.0), (3, 300.0), (4, 5350.0)]
     assert sink.received[4:7] == [(5, 5400.0), (6, 5500.0), (7, 5600.0)]
     assert source.number > 7
     assert 'the clock has jumped by 5 s' in whats(lockstep)
     assert 'the clock has jumped by -5 s' in whats(lockstep)
-
-
-def test_run_for_and_run_until_count_world_time(lockstep):
-    lockstep.inject(faults.TimeJump(-0.5, start=0.4), faults.ClockPause(start=0.6, duration=0.2))
-    lockstep.run_for(1.0)
-    assert (lockstep.world_time, lockstep.now) == (1_000_000_000, 1_300_000_000)
     with pytest.raises(LockstepError, match='not within'):
         lockstep.run_until(lambda: False, timeout=0.5)
     assert lockstep.world_time == 1_500_000_000
 
 
-def test_the_clock_does_not_go_below_one_nanosecond(lockstep):
-    lockstep.inject(faults.TimeJump(-9.0, start=0.5, duration=0.25))
+def test_the_clock_stays_within_what_a_stamp_can_represent(lockstep):
+    lockstep.inject(
+        faults.TimeJump(-9.0, start=0.5, duration=0.25), faults.TimeJump(1e300, start=1.0, duration=0.25)
+    )
     lockstep.run_for(0.6)
     assert lockstep.now == 100_000_001
     lockstep.run_for(0.4)
-    assert lockstep.now == 2_000_000_000
-
-
-def test_the_clock_does_not_go_beyond_what_a_stamp_can_represent(lockstep):
-    lockstep.inject(faults.TimeJump(1e300, start=0.5, duration=0.25))
-    lockstep.run_for(0.5)
     assert lockstep.now == (2**31 - 1) * 10**9
     lockstep.run_for(0.5)
-    assert lockstep.now == 2_000_000_000
-    with pytest.raises(ValueError, match=r'at most 2147483647 s, got 1e\+300 at 2 s'):
+    assert lockstep.now == 2_500_000_000
+    with pytest.raises(ValueError, match=r'at most 2147483647 s, got 1e\+300 at 2.5 s'):
         lockstep.jump(1e300)
 
 
@@ -115,20 +106,18 @@ def test_a_service_responds_late_or_never(lockstep):
     assert 'a response is never sent' in whats(lockstep)
 
 
-def test_a_service_that_does_not_exist_is_named(lockstep):
-    lockstep.inject(faults.LateService('aks', 1.0))
-    with pytest.raises(LockstepError, match=r"LateService\('aks', 1.0\): no service /aks was seen"):
-        lockstep.check_faults()
-    lockstep.close()
-
-
 def test_the_response_of_a_service_that_is_gone_is_lost(lockstep):
     lockstep.create(Relay)
     client = lockstep.node.create_client(Trigger, 'ask')
-    lockstep.inject(faults.LateService('ask', 0.3), faults.Kill('relay', start=0.2))
+    lockstep.inject(
+        faults.LateService('ask', 0.3), faults.Kill('relay', start=0.2), faults.LateService('aks', 1.0)
+    )
     future = client.call_async(Trigger.Request())
     lockstep.run_for(1.0)
     assert not future.done()
+    with pytest.raises(LockstepError, match=r"LateService\('aks', 1.0\): no service /aks was seen"):
+        lockstep.check_faults()
+    lockstep.close()
 
 
 # --- Faults of publishers
@@ -224,26 +213,19 @@ INVALID = [
     (lambda: faults.Loss('a', node=3), 'node must be a string, got 3'),
     (lambda: faults.Loss('a', probability=1.5), 'probability must be in [0, 1], got 1.5'),
     (lambda: faults.Loss('a', probability='x'), "probability must be a number, got 'x'"),
-    (lambda: faults.Loss('a', burst=0), 'burst must be an integer of at least 1, got 0'),
     (lambda: faults.Loss('a', burst=True), 'burst must be an integer of at least 1, got True'),
     (lambda: faults.Loss('a', start=-1), 'start must be zero or positive and finite, got -1'),
-    (lambda: faults.Loss('a', start=INF), 'start must be zero or positive and finite, got inf'),
     (lambda: faults.Loss('a', duration=0.0), 'duration must be positive, got 0'),
     (lambda: faults.Delay('a', float('nan')), 'must be zero or positive and finite, got nan'),
     (lambda: faults.Reorder('a', 0.5, 0.0), 'seconds must be positive and finite, got 0.0'),
     (lambda: faults.Duplicate('a', copies=1.5), 'copies must be an integer of at least 1, got 1.5'),
     (lambda: faults.RateLimit('a', 0), 'rate must be positive and finite, got 0'),
-    (lambda: faults.Slow('a', -1.0), 'seconds must be positive and finite, got -1.0'),
     (lambda: faults.TimeJump(0.0), 'seconds must not be zero, got 0.0'),
-    (lambda: faults.TimeJump(INF), 'seconds must be finite, got inf'),
     (lambda: faults.LateService('a', 0.0), 'seconds must be positive, got 0.0'),
     (lambda: faults.ParameterChange('a', 'b', None), 'value must be a bool, int, float, str, or a'),
     (lambda: faults.ParameterChange('a', 'b', [1, 'x']), "got [1, 'x']"),
     (lambda: faults.DeadWheel('front'), "wheel must be one of 'left', 'right', got 'front'"),
     (lambda: faults.SaturatedWheel('left', 0.0), 'max_velocity must be positive and finite, got 0.0'),
-    (lambda: faults.ActuatorLag(-1.0), 'seconds must be positive and finite, got -1.0'),
-    (lambda: faults.EncoderSteps(0), 'per_revolution must be an integer from 1 to 1000000000, got 0'),
-    (lambda: faults.EncoderSteps(1.5), 'per_revolution must be an integer from 1 to'),
     (lambda: faults.EncoderSteps(10**10), 'from 1 to 1000000000, got 10000000000'),
     (lambda: faults.Push(float('nan')), 'dx must be finite, got nan'),
     (lambda: faults.Push(noticed=1), 'noticed must be True or False, got 1'),
@@ -251,7 +233,6 @@ INVALID = [
     (lambda: faults.Slip(robot=''), 'robot must be a string that is not empty'),
     (lambda: faults.Corrupt('odom', 'x', 'broken'), "change must be one of 'nan', 'inf'"),
     (lambda: faults.Corrupt('odom', 'x', 'offset', INF - INF), "amount of 'offset' must be a finite"),
-    (lambda: faults.Corrupt('odom', 'x', 'scale', 'x'), "of 'scale' must be a finite number, got 'x'"),
     (lambda: faults.Corrupt('odom', 'x', 'offset', True), 'must be a finite number, got True'),
     (lambda: faults.Corrupt('odom', 'x', 'set', INF), "or a str (for others there are 'nan', 'inf'"),
     (lambda: faults.Corrupt('odom', 'x', 'set', None), 'a bool or a str'),
@@ -260,10 +241,10 @@ INVALID = [
 ]
 
 
-@pytest.mark.parametrize(('make', 'words'), INVALID)
-def test_invalid_values_are_named(make, words):
-    with pytest.raises(ValueError, match=re.escape(words)):
-        make()
+def test_invalid_values_are_named():
+    for make, words in INVALID:
+        with pytest.raises(ValueError, match=re.escape(words)):
+            make()
 
 
 # --- Faults of others

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
 
-import pytest
 from geometry_msgs.msg import Twist
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters
@@ -19,13 +19,29 @@ from diffdrive_jacobian.recording import parameter_query
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 
 VALUES = {f'parameter_{index}': ParameterValue(type=2, integer_value=index) for index in range(20)}
+INTEGERS = {name: value.integer_value for name, value in VALUES.items()}
+UNSET = ('unset', 'other', 'third')
+NAMES = (*list(VALUES)[:7], *UNSET, *list(VALUES)[7:])
+RECORDABLE = {
+    'flag': (True, ParameterValue(type=1, bool_value=True)),
+    'number': (0.5, ParameterValue(type=3, double_value=0.5)),
+    'text': ('a "b"', ParameterValue(type=4, string_value='a "b"')),
+    'bytes': ([[1], [255]], ParameterValue(type=5, byte_array_value=[b'\x01', b'\xff'])),
+    'flags': ([True, False], ParameterValue(type=6, bool_array_value=[True, False])),
+    'integers': ([1, -2], ParameterValue(type=7, integer_array_value=[1, -2])),
+    'numbers': ([0.5, 1.5], ParameterValue(type=8, double_array_value=[0.5, 1.5])),
+    'texts': (['a', 'b'], ParameterValue(type=9, string_array_value=['a', 'b'])),
+}
+UNKNOWN = {f'of_type_{kind}': ParameterValue(type=kind) for kind in (10, 11, 128, 255)}
+UNKNOWN['too_large'] = ParameterValue(type=4, string_value='x' * (parameter_query.MAX_TEXT + 1))
+TYPES = {name: value for name, (_, value) in RECORDABLE.items()} | UNKNOWN
 
 
 class Stranger(Node):
     """Publishes, and answers requests for parameters in its own way."""
 
-    def __init__(self, names, answer):
-        super().__init__('stranger', start_parameter_services=False)
+    def __init__(self, name, names, answer):
+        super().__init__(name, start_parameter_services=False)
         self.names, self.answer = names, answer
         self.asked = 0
         self.publisher = self.create_publisher(Twist, 'cmd_vel', 10)
@@ -59,99 +75,80 @@ def one_more(names):
     return [*known(names), ParameterValue(type=2, integer_value=99)] if len(names) > 1 else known(names)
 
 
-def none(names):
-    return []
+def of_all_types(names):
+    return [TYPES[name] for name in names]
 
 
-def recorded_parameters(lockstep, tmp_path, stranger):
-    """Record beside a stranger; gives what the bag holds of its parameters."""
-    lockstep.add(stranger)
+def recorded_parameters(lockstep, tmp_path, *strangers):
+    """Record beside strangers; gives what the bag holds of the parameters of each."""
+    for stranger in strangers:
+        lockstep.add(stranger)
     recording = LockstepRecording(lockstep, tmp_path / 'run')
     recording.look()
     lockstep.run_for(0.1)
-    stranger.publisher.publish(Twist())
+    for stranger in strangers:
+        stranger.publisher.publish(Twist())
     lockstep.run_for(0.1)
     recording.finish()
-    # Whatever it answers, its messages are recorded.
-    assert recording.summary.topics['/cmd_vel'] == 1
+    # Whatever they answer, their messages are recorded.
+    assert recording.summary.topics['/cmd_vel'] == len(strangers)
     reader = BoundedReader(tmp_path / 'run')
     reader.open()
-    text = dict(reader.storage.metadata.custom).get(f'{PARAMETERS}/stranger')
+    texts = dict(reader.storage.metadata.custom)
     reader.close()
-    return None if text is None else json.loads(text)
+    keys = [f'{PARAMETERS}/{stranger.get_name()}' for stranger in strangers]
+    return [json.loads(texts[key]) if key in texts else None for key in keys]
 
 
-INTEGERS = {name: value.integer_value for name, value in VALUES.items()}
+def reports(said):
+    """Return the reports of missing parameters by node."""
+    found = re.findall(r'parameters of /(\w+) are not all recorded: (.*)', said)
+    assert len(found) == len(dict(found))
+    return dict(found)
 
 
-@pytest.mark.parametrize('answer', [as_rclcpp, omitting, known, one_more])
-@pytest.mark.parametrize('unset', [(), ('unset', 'other', 'third')])
-def test_what_can_be_had_is_recorded(lockstep, tmp_path, capfd, answer, unset):
-    names = [*list(VALUES)[:7], *unset, *list(VALUES)[7:]]
-    stranger = Stranger(names, answer)
-    assert recorded_parameters(lockstep, tmp_path, stranger) == INTEGERS
+def test_what_can_be_had_is_recorded_and_the_rest_is_reported(lockstep, tmp_path, capfd):
+    answers = (as_rclcpp, omitting, known, one_more)
+    strangers = [Stranger(answer.__name__, NAMES, answer) for answer in answers]
+    complete = Stranger('complete', VALUES, known)
+    typed = Stranger('typed', TYPES, of_all_types)
+    found = recorded_parameters(lockstep, tmp_path, *strangers, complete, typed)
+    assert found[:5] == [INTEGERS] * 5
+    assert found[5] == {name: value for name, (value, _) in RECORDABLE.items()}
+    said = reports(capfd.readouterr().err)
+    assert sorted(said) == sorted([*(one.__name__ for one in answers), 'typed'])
+    for stranger in strangers:
+        assert all(name in said[stranger.get_name()] for name in UNSET)
+        assert stranger.asked < 2 * len(NAMES)
+    assert all(name in said['typed'] for name in UNKNOWN)
+
+
+def test_strange_names_and_a_node_that_answers_nothing(lockstep, tmp_path, capfd):
+    """Names are printed in short, without control characters."""
+    names = ['parameter_1', 'parameter_1', '', 'ä.b', 'a\nb', '\x1b[2J', 'x' * 10_000]
+    strange = Stranger('strange', names, omitting)
+    silent = Stranger('silent', ['y' * 500, '\x1b[2J', *VALUES], lambda names: [])
+    assert recorded_parameters(lockstep, tmp_path, strange, silent) == [{'parameter_1': 1}, None]
     said = capfd.readouterr().err
-    if unset:
-        assert said.count('parameters of /stranger are not all recorded: ') == 1
-        assert all(name in said for name in unset)
-        assert stranger.asked < 2 * len(names)
-    else:
-        assert 'not all recorded' not in said
-
-
-def test_known_types_are_recorded_and_others_left_out(lockstep, tmp_path, capfd):
-    recordable = {
-        'flag': (True, ParameterValue(type=1, bool_value=True)),
-        'number': (0.5, ParameterValue(type=3, double_value=0.5)),
-        'text': ('a "b"', ParameterValue(type=4, string_value='a "b"')),
-        'bytes': ([[1], [255]], ParameterValue(type=5, byte_array_value=[b'\x01', b'\xff'])),
-        'flags': ([True, False], ParameterValue(type=6, bool_array_value=[True, False])),
-        'integers': ([1, -2], ParameterValue(type=7, integer_array_value=[1, -2])),
-        'numbers': ([0.5, 1.5], ParameterValue(type=8, double_array_value=[0.5, 1.5])),
-        'texts': (['a', 'b'], ParameterValue(type=9, string_array_value=['a', 'b'])),
-    }
-    values = {name: value for name, (_, value) in recordable.items()}
-    unknown = {f'of_type_{kind}': ParameterValue(type=kind) for kind in (10, 11, 128, 255)}
-    unknown['too_large'] = ParameterValue(type=4, string_value='x' * (parameter_query.MAX_TEXT + 1))
-    values |= unknown
-    stranger = Stranger(values, lambda names: [values[name] for name in names])
-    assert recorded_parameters(lockstep, tmp_path, stranger) == {
-        name: value for name, (value, _) in recordable.items()
-    }
-    said = capfd.readouterr().err
-    assert all(f'no value of {name}' in said or name in said for name in unknown)
-
-
-def test_a_node_that_answers_nothing_is_recorded_without(lockstep, tmp_path, capfd):
-    names = [*VALUES, '\x1b[2J', 'y' * 500]
-    assert recorded_parameters(lockstep, tmp_path, Stranger(names[::-1], none)) is None
-    said = capfd.readouterr().err
-    assert 'and 17 more' in said
-    # Names are printed in short, without control characters.
+    assert 'and 17 more' in reports(said)['silent']
     assert '\x1b[2J' not in said
     assert '\\x1b[2J' in said
     assert 'y' * 81 not in said
 
 
-def test_duplicate_and_strange_names(lockstep, tmp_path):
-    names = ['parameter_1', 'parameter_1', '', 'ä.b', 'a\nb', '\x1b[2J', 'x' * 10_000]
-    found = recorded_parameters(lockstep, tmp_path, Stranger(names, omitting))
-    assert found == {'parameter_1': 1}
-
-
 def test_a_node_without_end_of_parameters_is_asked_for_some(lockstep, tmp_path, monkeypatch):
     monkeypatch.setattr(parameter_query, 'MAX_PARAMETERS', 5)
-    found = recorded_parameters(lockstep, tmp_path, Stranger(VALUES, known))
+    (found,) = recorded_parameters(lockstep, tmp_path, Stranger('endless', VALUES, known))
     assert found == dict(list(INTEGERS.items())[:5])
 
 
 def test_an_unset_parameter_of_an_ordinary_node(lockstep, tmp_path):
     """rclpy's own services, which answer as those of rclcpp."""
-    node = Node('stranger')
+    node = Node('ordinary')
     node.declare_parameter('number', 3)
     node.declare_parameter('unset', Parameter.Type.INTEGER)
     node.publisher = node.create_publisher(Twist, 'cmd_vel', 10)
-    found = recorded_parameters(lockstep, tmp_path, node)
+    (found,) = recorded_parameters(lockstep, tmp_path, node)
     assert found['number'] == 3
     assert 'unset' not in found
 

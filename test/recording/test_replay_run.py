@@ -14,21 +14,21 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosgraph_msgs.msg import Clock
 from support.bags import REAL as FOREIGN
 from support.bags import count_more
+from support.commands import interrupted, refused, run
 from support.lockstep_nodes import make_complete
 from support.processes import open_world
-from support.raw_bags import run_tool
 from support.recorded import recorded
 from support.ros_messages import goal, goals, twists
 
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.recording.replaying import Replayer
+from diffdrive_jacobian.recording.replaying import Playback, Replayer, ReplayProgress, replay
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.tools import replay_run
 
-LENGTH = 2.0
+LENGTH = 1.0
 FAST = ('-r', '50')
 ACKED = ('--wait-for-all-acked', '20000')
 """A reader may find the publisher later than the publisher finds the reader."""
@@ -36,7 +36,7 @@ ACKED = ('--wait-for-all-acked', '20000')
 
 @pytest.fixture(scope='module')
 def recorded_run(tmp_path_factory):
-    """A run of two seconds: a goal, its commands, the odometry."""
+    """A run of a second: a goal, its commands, the odometry."""
     path = tmp_path_factory.mktemp('bags') / 'run'
     with Lockstep() as world:
         world.add(make_complete(VirtualRobot, **{'linear__x__max_velocity': 0.5}))
@@ -86,12 +86,6 @@ def play(world, capfd):
     return play
 
 
-def interrupted():
-    signals = Signals()
-    signals.count = 1
-    return signals
-
-
 # --- What is played
 
 
@@ -109,7 +103,7 @@ def test_commands_come_as_recorded_and_only_they(world, bag, commands, play):
 def test_offset_and_another_name(world, bag, commands, play):
     """Playing under the recorded name instead would move the real robot."""
     real, received = (world.harness.listen(Twist, name) for name in ('cmd_vel', 'sim/cmd_vel'))
-    options = ('--start-offset', '1.5', '-m', 'cmd_vel:=sim/cmd_vel', '-w', '1')
+    options = ('--start-offset', '0.5', '-m', 'cmd_vel:=sim/cmd_vel', '-w', '1')
     code, out, _ = play(bag, *FAST, *options, *ACKED)
     assert code == 0
     count = int(out.splitlines()[-1].split()[0])
@@ -119,15 +113,11 @@ def test_offset_and_another_name(world, bag, commands, play):
     assert real == []
 
 
-@pytest.mark.process
-def test_goals_drive_a_new_robot(world, bag):
-    world.harness.add(VirtualRobot)
-    world.harness.add(GoToGoal)
-    told, commands = world.harness.listen(Goals, 'goals'), world.harness.listen(Twist, 'cmd_vel')
-    child = world.start('replay_run', str(bag), '--goals', '-w', '2', *ACKED)
-    world.harness.until(lambda: commands and not child.running, 'the controller drives')
+def test_goals_are_played_instead(world, bag, play):
+    told = world.harness.listen(Goals, 'goals')
+    assert play(bag, '--goals', '-w', '1', *ACKED)[0] == 0
+    world.harness.until(lambda: told, 'the goal has come')
     assert told[0].goals[0].pose.position.x == 1.0
-    assert child.exit() == 0
 
 
 @pytest.mark.process
@@ -150,29 +140,43 @@ def test_topics_are_played_with_a_clock_in_loops_until_interrupted(world, bag, r
 
 
 def test_the_clock_does_not_pass_the_end_at_any_rate(bag, play, impatient, monkeypatch):
-    signals, publish_time = Signals(), Replayer._publish_time
+    signals, publish_time, times = Signals(), Replayer._publish_time, []
 
     def publish_time_and_interrupt(player):
         publish_time(player)
-        signals.count = int(player._wall > 0)
+        times.append(player.position)
+        # The bag is played several times meanwhile.
+        signals.count = int(len(times) > 20)
 
     monkeypatch.setattr(Replayer, '_publish_time', publish_time_and_interrupt)
-    assert play(bag, '-r', '1e300', '-l', '--clock', '100', signals=signals)[0] == 130
+    assert play(bag, '-r', '1e300', '-l', '--clock', '1000', signals=signals)[0] == 130
+    assert max(times) - min(times) <= (LENGTH + 0.5) * 1e9
 
 
 # --- Subscriptions
 
 
-@pytest.mark.process
+class Late(ReplayProgress):
+    """Subscribes once more when only that is waited for."""
+
+    def __init__(self, harness):
+        self.received = None
+        self._harness = harness
+
+    def waiting(self, reason):
+        if self.received is None and reason == '/cmd_vel has 1 of 2 subscriptions':
+            self.received = self._harness.listen(Twist, 'cmd_vel')
+
+    def toggled(self):
+        return False
+
+
 def test_it_waits_for_the_required_number_of_subscriptions(world, bag, commands):
-    child = world.start('replay_run', str(bag), '-w', '2', '-r', '20', *ACKED)
-    received = [world.harness.listen(Twist, 'cmd_vel')]
-    child.until_says('waiting: /cmd_vel has 1 of 2 subscriptions')
-    received.append(world.harness.listen(Twist, 'cmd_vel'))
-    world.harness.until(
-        lambda: [len(one) for one in received] == [len(commands)] * 2, 'both have received everything'
-    )
-    assert child.exit() == 0
+    first, late = world.harness.listen(Twist, 'cmd_vel'), Late(world.harness)
+    result = replay(bag, Playback(rate=20.0), readers=2, acknowledgement_timeout=20.0, progress=late)
+    assert (result.played, result.messages) == (True, len(commands))
+    assert result.unacknowledged == ()
+    world.harness.until(lambda: len(first) == len(late.received) == len(commands), 'both have all')
 
 
 def test_nothing_is_played_to_fewer_subscriptions_than_required(bag, play):
@@ -236,25 +240,20 @@ def build(path, topics, step=1):
                 writer.write(connection, (1 + index * step) * 1_000_000_000, serialize_message(message))
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        (('BAG', '--goals', '--start-offset', '1'), 'no messages of /goals after --start-offset 1'),
-        (('BAG', '--topics', '/goals', '--start-offset', '1.5'), 'no messages of /goals after'),
-        (('SPARSE', '--loop'), 'no messages of cmd_vel, only of /goals (--all-topics plays them)'),
-        (('SPARSE', '--topics', '/cmd_vel'), 'no messages of /cmd_vel, only of /goals'),
-        (('EMPTY', '--all-topics', '--loop'), 'EMPTY has no messages'),
-    ],
-    ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
-)
-def test_nothing_to_play_is_an_error(bag, tmp_path, monkeypatch, play, arguments, words):
+def test_nothing_to_play_is_an_error(bag, tmp_path, monkeypatch, play):
     monkeypatch.chdir(tmp_path)
     build(tmp_path / 'EMPTY', {'/cmd_vel': [], '/goals': []})
     build(tmp_path / 'SPARSE', {'/cmd_vel': [], '/goals': [Goals()]})
-    code, out, err = play(*(str(bag) if one == 'BAG' else one for one in arguments))
-    assert (code, out, err.count('\n')) == (1, '', 1)
-    assert err.startswith('replay_run: error: nothing to play: ')
-    assert words in err
+    for arguments, words in (
+        ((bag, '--goals', '--start-offset', '0.7'), 'no messages of /goals after --start-offset 0.7'),
+        (('SPARSE', '--loop'), 'no messages of cmd_vel, only of /goals (--all-topics plays them)'),
+        (('SPARSE', '--topics', '/cmd_vel'), 'no messages of /cmd_vel, only of /goals'),
+        (('EMPTY', '--all-topics', '--loop'), 'EMPTY has no messages'),
+    ):
+        code, out, err = play(*arguments)
+        assert (code, out, err.count('\n')) == (1, '', 1)
+        assert err.startswith('replay_run: error: nothing to play: ')
+        assert words in err
 
 
 def test_times_that_are_far_apart_are_reported(tmp_path, play):
@@ -268,41 +267,27 @@ def test_times_that_are_far_apart_are_reported(tmp_path, play):
         assert words in err
 
 
-# --- Verification
+# --- Arguments
 
 
-def test_a_verified_run_is_as_recorded(capsys, bag):
-    code, out, _ = run_tool(replay_run.main, capsys, bag, '--verify')
+def test_a_run_is_verified_with_parameters_from_a_file(bag, tmp_path):
+    code, out, _ = run('replay_run', bag, '--verify')
     assert code == 0
     assert 'commands from cmd_vel_out' in out
     assert 'allowed 1e-09 m' in out
     assert out.splitlines()[-1] == 'the robot moves as recorded'
-
-
-def test_a_bag_of_others_is_verified_with_parameters_from_a_file(capsys, tmp_path):
-    code, out, _ = run_tool(replay_run.main, capsys, FOREIGN, '--verify')
-    assert code == 0
-    assert 'commands from cmd_vel,' in out
     file = tmp_path / 'slow.yaml'
     file.write_text('virtual_robot:\n  ros__parameters:\n    linear: {x: {max_velocity: 0.05}}\n')
-    arguments = (FOREIGN, '--verify', '--params-file', file)
-    code, out, _ = run_tool(replay_run.main, capsys, *arguments)
+    code, out, _ = run('replay_run', FOREIGN, '--verify', '--params-file', file)
     assert code == 1
     assert 'position: exceeded in' in out
     assert out.splitlines()[-1] == 'the robot moves NOT as recorded'
-    assert run_tool(replay_run.main, capsys, FOREIGN, '--verify', '--tolerance', '1e-6')[0] == 1
 
-
-# --- Arguments
 
 WRONG = [
-    (['file.txt', '--verify'], 'file.txt is not a bag'),
-    (['BAG', '-r', '-1'], 'must be positive'),
     (['BAG', '--start-offset', '99'], '--start-offset must be less than the length of the bag'),
-    (['BAG', '--start-offset', '1e300'], 'must be less than the length of the bag'),
     (['BAG', '--start-offset', '-1'], 'must be zero or positive and finite, got -1.0'),
-    (['BAG', '-r', '1e-12'], '--rate must be at least 4.'),
-    (['BAG', '-r', '1e-320'], '--rate must be at least 4.'),
+    (['BAG', '-r', '1e-12'], '--rate must be at least '),
     (['BAG', '--clock', '1e-12'], '--clock must be in [1e-09, 1e+09] Hz, got 1e-12'),
     (['BAG', '--clock', '1e12'], '--clock must be in [1e-09, 1e+09] Hz, got 1e+12'),
     (['BAG', '-m', '/cmd_vel:=~/x{y}'], "cannot be played as '~/x{y}': failed to resolve name"),
@@ -313,9 +298,7 @@ WRONG = [
     (['BAG', '--goals', '-m', 'cmd_vel:=/sim/cmd_vel'], 'that is played, /goals, got /cmd_vel'),
     (['BAG', '-m', 'cmd_vel:=/a', '/cmd_vel:=/b'], '/cmd_vel must be remapped once, got /a and /b'),
     (['BAG', '-m', '~/x{y}:=/cmd_vel'], 'remapping ~/x{y}:=/cmd_vel: '),
-    (['BAG', '-w', '0'], 'must be an integer of at least 1, got 0'),
     (['BAG', '--verify', '--params-file', 'file.txt'], 'file of ROS parameters, got file.txt'),
-    (['BAG', '--verify', '--tolerance', '0'], 'must be positive'),
     (['BAG', '--goals', '--verify'], 'not allowed with --verify: --goals'),
     (['--verify', 'BAG', '-r', '2'], 'not allowed with --verify: -r 2'),
     (['--verify', 'BAG', '--ros-args', '-p', 'x:=1'], 'not allowed with --verify: --ros-args'),
@@ -323,13 +306,9 @@ WRONG = [
 ]
 
 
-def test_wrong_arguments_are_reported(capsys, bag, tmp_path, monkeypatch):
+def test_wrong_arguments_are_reported(bag, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'file.txt').write_text('not a bag')
     for arguments, words in WRONG:
         given = [bag if one == 'BAG' else one for one in arguments]
-        code, _, err = run_tool(replay_run.main, capsys, *given)
-        assert code == 2, arguments
-        line = err.splitlines()[-1]
-        assert line.startswith('replay_run: error: ')
-        assert words in line
+        assert words in refused('replay_run', *given)

@@ -74,13 +74,14 @@ def test_nothing_is_wrong_with_a_robot_and_its_controller():
     assert list(check_clocks(graph(*PAIR))) == []
 
 
+def check(findings, words, problems=1):
+    """Check that something is found, in these words, and how many problems it is."""
+    text, count = found(findings)
+    assert words in text
+    assert (count, bool(text)) == (problems, bool(words))
+
+
 # --- Topics
-
-
-def test_two_types_of_a_topic_are_a_problem_with_its_parameter():
-    text, problems = found(check_topics(graph(PAIR[0], subscription('/robot', '/cmd_vel', STAMPED))))
-    assert f'/go_to_goal publishes /cmd_vel as {TWIST}, but /robot subscribes to it as {STAMPED}' in text
-    assert ('enable_stamped_cmd_vel' in text, problems) == (True, 1)
 
 
 SECOND = 1_000_000_000
@@ -103,62 +104,32 @@ def test_quality_that_does_not_match_is_a_problem(offered, requested, word):
     # The other way round it matches.
     assert mismatch(Quality(**requested), Quality(**offered)) == []
     pair = publisher('/a', '/x', **offered), subscription('/b', '/x', **requested)
-    text, problems = found(check_topics(graph(*pair)))
-    assert ('/b receives nothing of /a on /x' in text, problems) == (True, 1)
+    check(check_topics(graph(*pair)), '/b receives nothing of /a on /x')
+    others = publisher('/c', '/x', **requested)
+    check(check_topics(graph(*pair, others)), 'It receives the other publishers.')
 
 
-def test_a_subscription_that_misses_one_of_two_publishers_is_told_apart():
-    endpoints = (
-        publisher('/a', '/x', reliability='BEST_EFFORT'),
-        publisher('/c', '/x'),
-        subscription('/b', '/x'),
-    )
-    assert 'It receives the other publishers.' in found(check_topics(graph(*endpoints)))[0]
-    assert 'other publishers' not in found(check_topics(graph(endpoints[0], endpoints[2])))[0]
+TOPICS = {
+    f'/go_to_goal publishes /cmd_vel as {TWIST}, but /robot subscribes to it as {STAMPED}': (
+        (PAIR[0], subscription('/robot', '/cmd_vel', STAMPED)),
+        1,
+    ),
+    '/go_to_goal publishes /cmd_vel, but nobody subscribes': (PAIR[:1], 1),
+    # A near miss.
+    '/r/robot subscribes to /r/cmd_vel': ((PAIR[0], subscription('/r/robot', '/r/cmd_vel')), 1),
+    'start wheel_bridge': ((subscription('/virtual_robot', '/joint_command', STATES),), 1),
+    # In general a topic needs no reader.
+    '': ((publisher('/robot', '/odom', ODOMETRY), subscription('/robot', '/cmd_vel')), 0),
+    '/other and /virtual_robot publish /odom': ((*PAIR, publisher('/other', '/odom', ODOMETRY)), 1),
+    '/go_to_goal and /teleop publish /cmd_vel': ((*PAIR, publisher('/teleop', '/cmd_vel')), 0),
+}
 
 
-def test_a_command_that_nobody_reads_is_a_problem_that_names_the_near_miss():
-    text, problems = found(check_topics(graph(PAIR[0], subscription('/r/robot', '/r/cmd_vel'))))
-    assert ('/go_to_goal publishes /cmd_vel, but nobody subscribes' in text, problems) == (True, 1)
-    assert 'start virtual_robot' in text
-    assert '/r/robot subscribes to /r/cmd_vel' in text
-
-
-def test_missing_publishers_are_problems():
-    text, problems = found(
-        check_topics(
-            graph(
-                subscription('/go_to_goal', '/odom', ODOMETRY),
-                subscription('/virtual_robot', '/joint_command', STATES),
-            )
-        )
-    )
-    assert problems == 2
-    assert '/go_to_goal subscribes to /odom, but nobody publishes it' in text
-    assert 'start wheel_bridge' in text
-
-
-def test_topics_without_readers_are_no_problem_in_general():
-    endpoints = (
-        publisher('/robot', '/joint_states', STATES),
-        publisher('/robot', '/odom', ODOMETRY),
-        publisher('/robot', '/rosout', 'rcl_interfaces/msg/Log'),
-        subscription('/robot', '/cmd_vel'),
-        subscription('/go_to_goal', '/goal_pose', 'geometry_msgs/msg/PoseStamped'),
-    )
-    assert found(check_topics(graph(*endpoints))) == ('', 0)
-
-
-def test_two_robots_on_one_odom_are_a_problem_and_two_drivers_a_note():
-    text, problems = found(check_topics(graph(*PAIR, publisher('/other', '/odom', ODOMETRY))))
-    assert ('/other and /virtual_robot publish /odom' in text, problems) == (True, 1)
-    text, problems = found(check_topics(graph(*PAIR, publisher('/teleop', '/cmd_vel'))))
-    assert ('/go_to_goal and /teleop publish /cmd_vel' in text, problems) == (True, 0)
-
-
-def test_two_nodes_of_one_name_are_a_problem():
-    text, problems = found(check_topics(graph(*PAIR, nodes=(*NODES, NODES[0]))))
-    assert ('2 nodes have the name /go_to_goal' in text, problems) == (True, 1)
+def test_topics_that_do_not_fit_are_named_with_a_remedy():
+    for words, (endpoints, problems) in TOPICS.items():
+        check(check_topics(graph(*endpoints)), words, problems)
+    twice = graph(*PAIR, nodes=(*NODES, NODES[0]))
+    check(check_topics(twice), '2 nodes have the name /go_to_goal')
 
 
 def test_names_are_listed():
@@ -177,8 +148,8 @@ RUNNING = ClockMessages(messages=100, advanced=3.0)
 
 def test_simulated_time_needs_one_running_clock():
     others = {'nodes': SIMULATED, 'seconds': 3.0}
-    assert found(check_clocks(graph(*PAIR, TIME, clock=RUNNING, **others))) == ('', 0)
     cases = {
+        '': graph(*PAIR, TIME, clock=RUNNING, **others),
         'nobody publishes /clock': graph(*PAIR, **others),
         '/replay_run and /simulator publish /clock': graph(
             *PAIR, TIME, publisher('/replay_run', '/clock', CLOCK), clock=RUNNING, **others
@@ -188,36 +159,28 @@ def test_simulated_time_needs_one_running_clock():
         'went back 2 times': graph(*PAIR, TIME, clock=replace(RUNNING, went_back=2), **others),
     }
     for words, described in cases.items():
-        text, problems = found(check_clocks(described))
-        assert (words in text, problems) == (True, 1), text
+        check(check_clocks(described), words, int(words != ''))
 
 
 def test_a_node_with_another_clock_is_a_problem():
     nodes = (SIMULATED[0], NODES[1], Participant('/unknown', None))
-    text, problems = found(check_clocks(graph(*PAIR, TIME, nodes=nodes, clock=RUNNING, seconds=3.0)))
-    assert ('/go_to_goal uses simulated time, /virtual_robot does not' in text, problems) == (True, 1)
-    text, problems = found(check_clocks(graph(*PAIR, TIME, clock=RUNNING, seconds=3.0)))
-    assert ('but no node uses it' in text, problems) == (True, 0)
+    mixed = graph(*PAIR, TIME, nodes=nodes, clock=RUNNING, seconds=3.0)
+    check(check_clocks(mixed), '/go_to_goal uses simulated time, /virtual_robot does not')
+    unused = graph(*PAIR, TIME, clock=RUNNING, seconds=3.0)
+    check(check_clocks(unused), 'but no node uses it', problems=0)
 
 
-@pytest.mark.parametrize(
-    ('age', 'simulated', 'words'),
-    [
+def test_stamps_far_from_the_time_are_a_problem():
+    """Those of simulated time and of an unknown clock are compared with the simulated one."""
+    for age, simulated_age, words in (
         (0.02, None, ''),
         (3600.0, None, '3.6e+03 s old'),
         (-5.0, None, '5 s in the future'),
-        # By the clock of its publisher, not by the other one.
         (3600.0, 0.01, '3.6e+03 s old'),
         (None, None, ''),
-    ],
-)
-def test_stamps_far_from_the_time_are_a_problem(age, simulated, words):
-    stream = Stream(topic='/odom', messages=5, rate=50.0, age=age, simulated_age=simulated)
-    text, problems = found(check_clocks(graph(*PAIR, streams=(stream,))))
-    assert (words in text, problems) == (True, int(words != ''))
-
-
-def test_stamps_of_simulated_time_and_of_an_unknown_clock_are_compared_with_it():
+    ):
+        stream = Stream(topic='/odom', messages=5, rate=50.0, age=age, simulated_age=simulated_age)
+        check(check_clocks(graph(*PAIR, streams=(stream,))), words, int(words != ''))
     stream = Stream(topic='/odom', messages=5, rate=50.0, age=1e9, simulated_age=0.01)
     for nodes in (SIMULATED, ()):
         others = {'nodes': nodes, 'clock': RUNNING, 'seconds': 3.0}
@@ -240,11 +203,11 @@ def test_segments_of_killed_processes_are_found(tmp_path):
 
 def test_full_shared_memory_is_a_problem_and_stale_segments_are_a_note():
     memory = SharedMemory(size=10**9, free=10**8)
-    assert found(check_shared_memory(memory)) == ('', 0)
-    text, problems = found(check_shared_memory(replace(memory, stale=3, stale_bytes=2_000_000)))
-    assert ('3 segments of killed processes' in text, 'shm clean' in text, problems) == (True, True, 0)
-    text, problems = found(check_shared_memory(replace(memory, free=1000)))
-    assert ('is full: 1.0 kB of 1.0 GB are free' in text, problems) == (True, 1)
+    check(check_shared_memory(memory), '', 0)
+    stale = replace(memory, stale=3, stale_bytes=2_000_000)
+    check(check_shared_memory(stale), '3 segments of killed processes', 0)
+    check(check_shared_memory(stale), 'shm clean', 0)
+    check(check_shared_memory(replace(memory, free=1000)), 'is full: 1.0 kB of 1.0 GB are free')
     for missing in (None, replace(memory, writable=False)):
         assert found(check_shared_memory(missing))[1] == 0
 
@@ -254,22 +217,16 @@ WIRED = Interface('eth0', up=True, loopback=False, multicast=True)
 
 
 def test_loopback_and_multicast_are_checked():
-    assert found(check_network((LOOPBACK, WIRED), 'SUBNET', '')) == ('', 0)
-    assert found(check_network((), 'SUBNET', '')) == ('', 0)
-    text, problems = found(check_network((replace(LOOPBACK, up=False), WIRED), 'LOCALHOST', ''))
-    assert ('loopback interface is down' in text, problems) == (True, 1)
-    deaf = replace(WIRED, multicast=False)
-    text, problems = found(check_network((LOOPBACK, deaf), 'SUBNET', ''))
-    assert ('no network interface has multicast (eth0)' in text, problems) == (True, 1)
+    deaf = LOOPBACK, replace(WIRED, multicast=False)
+    check(check_network((LOOPBACK, WIRED), 'SUBNET', ''), '', 0)
+    check(check_network((), 'SUBNET', ''), '', 0)
+    down = replace(LOOPBACK, up=False), WIRED
+    check(check_network(down, 'LOCALHOST', ''), 'loopback interface is down')
+    check(check_network(deaf, 'SUBNET', ''), 'no network interface has multicast (eth0)')
     # On this machine multicast is not needed.
-    assert found(check_network((LOOPBACK, deaf), 'LOCALHOST', ''))[1] == 0
-    assert (
-        'does not work (no message'
-        in found(check_network((LOOPBACK, WIRED), 'SUBNET', 'no message arrives'))[0]
-    )
-
-
-def test_this_machine_has_a_loopback_interface():
+    assert found(check_network(deaf, 'LOCALHOST', ''))[1] == 0
+    silent = check_network((LOOPBACK, WIRED), 'SUBNET', 'no message arrives')
+    assert 'does not work (no message' in found(silent)[0]
     assert any(one.loopback for one in interfaces())
 
 
@@ -280,43 +237,36 @@ SOURCES = dict.fromkeys(ROS_PACKAGES, WHEELS)
 USUAL = Environment(python='3.12.3', versions={'rclpy': '7.1.6'}, sources=SOURCES)
 
 
-@pytest.mark.parametrize(
-    ('variables', 'words', 'expected'),
-    [
-        ({}, '', 0),
-        ({'ROS_DOMAIN_ID': '101', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}, '', 0),
-        ({'ROS_DOMAIN_ID': '233'}, "must be in 0 to 232, got '233'", 1),
-        ({'ROS_DOMAIN_ID': 'x'}, "got 'x'", 1),
-        ({'ROS_DOMAIN_ID': '٣'}, 'must be in 0 to 232', 1),
-        ({'ROS_DOMAIN_ID': '150'}, 'can be taken by other programs', 0),
-        ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}, 'no other process is found', 1),
-        ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'localhost'}, "got 'localhost': SUBNET is used", 1),
-        ({'ROS_LOCALHOST_ONLY': '1'}, 'deprecated', 0),
-        ({'ROS_LOCALHOST_ONLY': 'true'}, "must be 0 or 1, got 'true': it has no effect", 1),
-        ({'ROS_DISCOVERY_SERVER': '10.0.0.1'}, 'ROS_SUPER_CLIENT', 0),
-        ({'ROS_DISTRO': 'humble'}, 'ROS_DISTRO is humble', 0),
-        ({'FASTRTPS_DEFAULT_PROFILES_FILE': '/nowhere.xml'}, 'does not exist: /nowhere.xml', 1),
-    ],
-)
-def test_variables_that_keep_nodes_apart(variables, words, expected):
-    text, problems = found(check_environment(replace(USUAL, variables=variables)))
-    assert (words in text, problems) == (True, expected)
-    assert bool(text) == bool(words)
+VARIABLES = [
+    ({}, '', 0),
+    ({'ROS_DOMAIN_ID': '101', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}, '', 0),
+    ({'ROS_DOMAIN_ID': '233'}, "must be in 0 to 232, got '233'", 1),
+    ({'ROS_DOMAIN_ID': '٣'}, 'must be in 0 to 232', 1),
+    ({'ROS_DOMAIN_ID': '150'}, 'can be taken by other programs', 0),
+    ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}, 'no other process is found', 1),
+    ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'localhost'}, "got 'localhost': SUBNET is used", 1),
+    ({'ROS_LOCALHOST_ONLY': '1'}, 'deprecated', 0),
+    ({'ROS_LOCALHOST_ONLY': 'true'}, "must be 0 or 1, got 'true': it has no effect", 1),
+    ({'ROS_DISCOVERY_SERVER': '10.0.0.1'}, 'ROS_SUPER_CLIENT', 0),
+    ({'ROS_DISTRO': 'humble'}, 'ROS_DISTRO is humble', 0),
+    ({'FASTRTPS_DEFAULT_PROFILES_FILE': '/nowhere.xml'}, 'does not exist: /nowhere.xml', 1),
+]
+INSTALLATIONS = {
+    'two installations of ROS are mixed: ': {'sources': {**SOURCES, 'rclpy': INSTALLATION}},
+    'there is no rclpy, geometry_msgs': {'sources': {}},
+    'rclpy 9.1.0 is not that of ROS 2 Jazzy': {'versions': {'rclpy': '9.1.0'}},
+    'is rmw_x, which is not installed': {
+        'rmw_missing': True,
+        'variables': {'RMW_IMPLEMENTATION': 'rmw_x'},
+    },
+}
 
 
-def test_installations_that_do_not_suit():
-    cases = {
-        'two installations of ROS are mixed: ': {'sources': {**SOURCES, 'rclpy': INSTALLATION}},
-        'there is no rclpy, geometry_msgs': {'sources': {}},
-        'rclpy 9.1.0 is not that of ROS 2 Jazzy': {'versions': {'rclpy': '9.1.0'}},
-        'is rmw_x, which is not installed': {
-            'rmw_missing': True,
-            'variables': {'RMW_IMPLEMENTATION': 'rmw_x'},
-        },
-    }
-    for words, changes in cases.items():
-        text, problems = found(check_environment(replace(USUAL, **changes)))
-        assert (words in text, problems) == (True, 1), text
+def test_variables_that_keep_nodes_apart_and_installations_that_do_not_suit():
+    for variables, words, problems in VARIABLES:
+        check(check_environment(replace(USUAL, variables=variables)), words, problems)
+    for words, changes in INSTALLATIONS.items():
+        check(check_environment(replace(USUAL, **changes)), words)
 
 
 def test_the_reach_of_the_discovery():

@@ -5,9 +5,13 @@ from __future__ import annotations
 import json
 
 import pytest
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
 
 from diffdrive_jacobian.diagnosis.graph import Graph, Participant
 from diffdrive_jacobian.diagnosis.machine import SharedMemory
+from diffdrive_jacobian.diagnosis.observation import Observer
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import doctor
 
@@ -29,12 +33,6 @@ def observed(monkeypatch):
 
 
 def test_an_observer_describes_what_it_sees(ros):
-    from rclpy.node import Node
-    from sensor_msgs.msg import JointState
-
-    from diffdrive_jacobian.diagnosis.observation import Observer
-    from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-
     observer = ros.add(Observer, name='_doctor')
     ros.add(VirtualRobot, parameters={'publish_rate': 100.0})
     ros.add(Node, node_name='simulated', parameters={'use_sim_time': True})
@@ -72,10 +70,6 @@ def test_an_observer_describes_what_it_sees(ros):
 
 
 def test_an_observer_ignores_names_that_cannot_be_queried(ros, monkeypatch):
-    from rclpy.node import Node
-
-    from diffdrive_jacobian.diagnosis.observation import Observer
-
     few_services = {'start_type_description_service': False}
     ros.add(Node, node_name='n' * 240, start_parameter_services=False, parameters=few_services)
     ros.add(Node, node_name='usual')
@@ -102,9 +96,6 @@ def test_exit_code_and_report_depend_on_problems(observed, capsys):
     assert '2 nodes found\n  /a (simulated time)\n  /a (clock unknown)\n' in said
     assert 'problem 1: 2 nodes have the name /a\n  remedy: stop one of them' in said
     assert said.endswith('\n2 problems found\n')
-
-
-def test_the_report_as_json(observed, capsys):
     observed(Graph(nodes=(Participant('/a', True),)))
     assert doctor.main(['--json'], Signals()) == 1
     report = json.loads(capsys.readouterr().out)
@@ -129,9 +120,3 @@ def test_an_import_that_fails_is_a_problem(observed, monkeypatch, capsys):
     monkeypatch.setattr(doctor, '_observe', fail)
     assert doctor.main([], Signals()) == 1
     assert 'ROS cannot be used: librmw_fastrtps_cpp.so: cannot open shared' in capsys.readouterr().out
-
-
-def test_an_interruption_is_reported_by_its_exit_code(observed, capsys):
-    signals = Signals()
-    signals.count = 1
-    assert doctor.main([], signals) == 130

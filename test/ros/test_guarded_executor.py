@@ -6,7 +6,6 @@ import time
 from functools import partial
 
 import pytest
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
@@ -19,7 +18,7 @@ from diffdrive_jacobian.ros.guarded_executor import GuardedExecutor
 from diffdrive_jacobian.ros.rclpy_internals import events_executor
 from diffdrive_jacobian.ros.runner import ros_context
 
-FLOOD = 600
+FLOOD = 400
 """Messages that are published before any of them is handled."""
 
 
@@ -129,14 +128,14 @@ def test_floods_move_the_nodes_for_longer_and_longer_and_are_logged_once(monkeyp
     served.node.create_timer(0.01, lambda: None)
     assert not served.executor.fair
     holds = []
-    for flood in range(3):
+    for flood in range(2):
         served.publish(range(flood * FLOOD, (flood + 1) * FLOOD))
         assert True in served.spin(lambda: len(served.received) == (flood + 1) * FLOOD)  # noqa: B023
         holds.append(served.executor.hold)
         served.spin(lambda: not served.executor.fair)
         served.settle()
-    assert holds == [0.05, 0.1, 0.2]
-    assert served.received == [str(number) for number in range(3 * FLOOD)]
+    assert holds == [0.05, 0.1]
+    assert served.received == [str(number) for number in range(2 * FLOOD)]
     monkeypatch.setattr(guarded_executor, 'QUIET', 0.05)
     said = ''
 
@@ -173,14 +172,14 @@ def test_one_message_of_each_of_many_topics_moves_nothing(served):
         received.append(message)
         busy(1e-3)
 
-    topics = [f'topic{number}' for number in range(60)]
+    topics = [f'topic{number}' for number in range(30)]
     publishers = [served.peer.create_publisher(String, topic, 10) for topic in topics]
     for topic in topics:
         served.node.create_subscription(String, topic, on_message, 10)
-    for count in range(1, 4):
+    for count in range(1, 3):
         for publisher in publishers:
             publisher.publish(String())
-        assert served.spin(lambda: len(received) == 60 * count) == {False}  # noqa: B023
+        assert served.spin(lambda: len(received) == 30 * count) == {False}  # noqa: B023
 
 
 def test_nodes_are_not_moved_back_while_a_coroutine_waits(served):
@@ -210,25 +209,6 @@ def test_a_load_that_only_the_events_executor_can_handle_moves_back_in_the_end(m
     served.until_received(sent[-1])
 
 
-def test_messages_that_were_announced_before_are_taken_before_nodes_move_back(served):
-    # The middleware does not announce them again.
-    served.listen()
-    served.publish(range(50))
-    served.move()
-    served.move()
-    assert len(served.received) == 50
-    served.publish(['after'])
-    served.until_received('after')
-
-
-def test_nodes_that_were_destroyed_are_moved_too(monkeypatch, served):
-    monkeypatch.setattr(guarded_executor, 'LONGEST_HOLD', 0.0)
-    for node in served.nodes:
-        node.destroy_node()
-    served.move()
-    served.move()
-
-
 async def _awaiting(take, message):
     take(message)
 
@@ -249,12 +229,6 @@ def test_callbacks_that_need_a_wait_set_get_it(served, make_callback):
     served.spin(lambda: received)
 
 
-def test_a_context_that_is_shut_down_ends_the_loop(on_either):
-    on_either.node.create_timer(0.01, on_either.context.try_shutdown)
-    with pytest.raises(ExternalShutdownException):
-        on_either.spin(lambda: False)
-
-
 # --- What survives a move
 
 
@@ -264,15 +238,28 @@ def test_no_message_request_or_response_is_lost_by_moves(served):
     served.node.create_service(Trigger, 'trigger', lambda request, response: response)
     client = served.peer.create_client(Trigger, 'trigger')
     served.spin(client.service_is_ready)
-    for number in range(1, 61):
+    for number in range(1, 19):
         served.publish(range(3 * number - 3, 3 * number))
         client.call_async(Trigger.Request()).add_done_callback(answers.append)
         if number % 3 == 0:
             # Some are handled before the move.
             served.executor.spin_once(timeout_sec=0.0)
         served.move()
+        if number % 5 == 0:
+            # The middleware does not announce again what it has announced before.
+            served.move()
         served.spin(lambda: (len(answers), len(served.received)) == (number, 3 * number))  # noqa: B023
-    assert served.received == [str(number) for number in range(180)]
+    assert served.received == [str(number) for number in range(54)]
+
+
+def test_a_coroutine_that_waits_on_the_left_executor_ends(served):
+    future, done = served.await_future()
+    served.executor.spin_once(timeout_sec=0.01)
+    served.move()
+    served.executor.spin_once(timeout_sec=0.01)
+    future.set_result('done')
+    served.spin(lambda: done)
+    assert done == ['done']
 
 
 def test_a_message_for_the_executor_that_was_left_is_received_at_once(on_either):
@@ -287,22 +274,12 @@ def test_a_message_for_the_executor_that_was_left_is_received_at_once(on_either)
 
 def test_timers_keep_the_time_of_their_next_expiry(on_either):
     ticks = []
-    timers = [on_either.node.create_timer(period, lambda: ticks.append(1)) for period in (30.0, 0.02)]
+    slow, _ = (on_either.node.create_timer(period, lambda: ticks.append(1)) for period in (30.0, 0.02))
     on_either.spin(lambda: ticks)
-    before = [timer.time_until_next_call() for timer in timers]
+    before = slow.time_until_next_call()
     on_either.move()
-    after = [timer.time_until_next_call() for timer in timers]
-    assert all(left <= earlier for left, earlier in zip(after, before, strict=True))
+    assert slow.time_until_next_call() <= before
     on_either.spin(lambda: len(ticks) == 3)
-
-
-def test_a_coroutine_that_waits_on_the_left_executor_ends(served):
-    future, done = served.await_future()
-    served.executor.spin_once(timeout_sec=0.01)
-    served.move()
-    served.executor.spin_once(timeout_sec=0.01)
-    future.set_result('done')
-    served.spin(lambda: done)
 
 
 def test_nodes_and_entities_that_are_created_after_a_move_are_executed(on_either):
