@@ -1,7 +1,7 @@
 """SE(2): wrapping, the group, its exponential, the exact arc of a held twist, the Jacobians of exp.
 
-Laws are checked for one batch of random poses and twists. On purpose many turns are next to zero and next
-to half a turn, where formulas lose digits.
+Laws are checked for one batch of random poses and twists. On purpose many turns are next to zero and
+next to half a turn, where formulas lose digits.
 """
 
 from __future__ import annotations
