@@ -41,20 +41,44 @@ def true_or_refused(call, expected, **close):
     return True
 
 
-@pytest.mark.parametrize('rows', [1, 2, 3])
+@pytest.mark.parametrize('rows', [2, 3])
 def test_a_weighted_jacobian_that_overflows_raises_an_error(rows):
-    x_dot, options = np.ones(rows), {'weights': [1e-20, 1.0, 1.0]}
-    for J in (J3[:rows] * 1e300, np.stack([J3[:rows] * 1e300] * 2)):
-        for call in (
-            lambda J: iv.pseudoinverse(J, **options),
-            lambda J: iv.null_space_projector(J, **options),
-            lambda J: iv.null_space_projector(J, 0.1, **options),
-            lambda J: iv.damped_least_squares(J, x_dot, 0.1, **options),
-            lambda J: iv.redundant(J, x_dot, np.ones(3), 0.1, **options),
-            lambda J: resolved_rate(J, x_dot, x_dot, x_dot, 1.0, 0.1, **options),
-        ):
-            with pytest.raises(ValueError, match=r'^J\b.* weights must'):
-                call(J)
+    J, x_dot, options = J3[:rows] * 1e300, np.ones(rows), {'weights': [1e-20, 1.0, 1.0]}
+    for call in (
+        lambda: iv.pseudoinverse(J, **options),
+        lambda: iv.null_space_projector(J, 0.1, **options),
+        lambda: iv.damped_least_squares([J, J], x_dot, 0.1, **options),
+        lambda: iv.redundant(J, x_dot, np.ones(3), 0.1, **options),
+        lambda: resolved_rate(J, x_dot, x_dot, x_dot, 1.0, 0.1, **options),
+    ):
+        with pytest.raises(ValueError, match=r'^J\b.* weights must'):
+            call()
+
+
+@pytest.mark.parametrize(
+    ('J', 'x_dot', 'damping', 'expected'),
+    [
+        ([[1.0, 0.0], [0.0, 1e-140]], [1.0, 1.0], 1e-300, [1.0, 1e140]),
+        ([[1.0, 0.0], [0.0, 1e-170]], [1.0, 1.0], 1e-300, [1.0, 0.0]),
+        ([[0.0, 1e-140], [1.0, 0.0]], [1.0, 1.0], 1e-140, [1.0, 5e139]),
+        ([[1e-140, 0.0], [0.0, 1e-140]], [1e200, 0.0], 0.0, None),
+        ([[1e300, 0.0], [0.0, 1e290]], [1e300, 1e290], 0.0, None),
+        (1e-140 * np.eye(3), [1e-140, 0.0, 0.0], 1e-140, [0.5, 0.0, 0.0]),
+        (1e-140 * np.eye(3), [1e200, 1.0, 0.0], 0.0, None),
+    ],
+    ids=str,
+)
+def test_extreme_units_give_numbers_alone_and_in_a_batch_or_an_error(J, x_dot, damping, expected):
+    if expected is None:
+        with pytest.raises(ValueError, match=OVERFLOWS):
+            iv.damped_least_squares(J, x_dot, damping)
+        return
+    alone = iv.damped_least_squares(J, x_dot, damping)
+    np.testing.assert_allclose(alone, expected, rtol=1e-9)
+    company = np.stack([np.eye(len(J)), J, 1e-3 * np.eye(len(J))])
+    together = iv.damped_least_squares(company, x_dot, [0.1, damping, 0.0])
+    assert np.array_equal(together[1], alone)
+    assert np.array_equal(iv.redundant(J, x_dot, np.zeros(len(J)), damping), alone)
 
 
 @pytest.mark.parametrize('scale', [1e-140, 1e150, 1e155, 1e307])
