@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import operator
 import struct
 
-import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
 from hypothesis import given, settings
@@ -58,12 +56,10 @@ from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 
 INPUTS = [
     (VirtualRobot, {}, Twist, 'cmd_vel'),
-    (VirtualRobot, {'enable_stamped_cmd_vel': True}, TwistStamped, 'cmd_vel'),
     (VirtualRobot, {'command_interface': 'wheels'}, JointState, 'joint_command'),
     (VirtualRobot, {}, PoseWithCovarianceStamped, 'initialpose'),
     (GoToGoal, {}, Odometry, 'odom'),
     (GoToGoal, {}, PoseStamped, 'goal_pose'),
-    (WheelBridge, {}, Twist, 'cmd_vel'),
     (WheelBridge, {'enable_stamped_cmd_vel': True}, TwistStamped, 'cmd_vel'),
 ]
 
@@ -75,7 +71,7 @@ def test_bytes_that_are_no_message_are_dropped_and_named(
     lockstep.add(make(node_class, **parameters))
     publisher = lockstep.node.create_publisher(message_class, topic, 10)
     valid = serialize_message(message_class())
-    for data in (b'', valid[:3], valid[:-12], b'\0\1\0\0' + b'\xff' * 40, b'\1\2' + valid[2:]):
+    for data in (b'', valid[:-12], b'\0\1\0\0' + b'\xff' * 40, b'\1\2' + valid[2:]):
         publisher.publish(data)
         lockstep.settle()
     # The log is throttled, and the node goes on.
@@ -84,17 +80,11 @@ def test_bytes_that_are_no_message_are_dropped_and_named(
     lockstep.run_for(0.1)
 
 
-def big_endian(message):
-    """Serialize a message of doubles only, in the other byte order."""
-    data = serialize_message(message)
-    count = (len(data) - 4) // 8
-    return b'\0\0\0\0' + struct.pack(f'>{count}d', *struct.unpack_from(f'<{count}d', data, 4))
-
-
 def test_a_command_of_a_big_endian_machine_is_followed(lockstep):
     applied = lockstep.listen(TwistStamped, 'cmd_vel_out')
     lockstep.add(make(VirtualRobot))
-    lockstep.node.create_publisher(Twist, 'cmd_vel', 10).publish(big_endian(twist(0.5, -0.25)))
+    data = b'\0\0\0\0' + struct.pack('>6d', 0.5, 0.0, 0.0, 0.0, 0.0, -0.25)
+    lockstep.node.create_publisher(Twist, 'cmd_vel', 10).publish(data)
     lockstep.settle()
     assert (applied[-1].twist.linear.x, applied[-1].twist.angular.z) == (0.5, -0.25)
 
@@ -103,22 +93,20 @@ def test_names_change_with_the_parameters(lockstep):
     odom, states = lockstep.listen(Odometry, 'odom'), lockstep.listen(JointState, 'joint_states')
     applied = lockstep.listen(TwistStamped, 'cmd_vel_out')
     robot = lockstep.add(make(VirtualRobot))
-    names = {'odom': 'odom', 'base': 'base_link', 'wheels': ['left_wheel_joint', 'right_wheel_joint']}
+    names = {'odom_frame_id': 'odom', 'base_frame_id': 'base_link'}
+    names |= {'left_wheel_name': 'left_wheel_joint', 'right_wheel_name': 'right_wheel_joint'}
     for changes in (
         {},
         {'odom_frame_id': 'Ö', 'base_frame_id': 'ein längerer Name'},
         {'left_wheel_name': 'l', 'right_wheel_name': 'räder rechts'},
     ):
         assert not changes or change(robot, **changes).successful
-        names['odom'] = changes.get('odom_frame_id', names['odom'])
-        names['base'] = changes.get('base_frame_id', names['base'])
-        if 'left_wheel_name' in changes:
-            names['wheels'] = [changes['left_wheel_name'], changes['right_wheel_name']]
+        names |= changes
         lockstep.publish('cmd_vel', twist(0.5, 0.25))
         lockstep.run_for(0.05)
-        assert (odom[-1].header.frame_id, odom[-1].child_frame_id) == (names['odom'], names['base'])
-        assert applied[-1].header.frame_id == names['base']
-        assert list(states[-1].name) == names['wheels']
+        frames = odom[-1].header.frame_id, odom[-1].child_frame_id
+        assert [*frames, *states[-1].name] == list(names.values())
+        assert applied[-1].header.frame_id == names['base_frame_id']
 
 
 def test_the_controller_reads_frame_and_pose_of_an_odometry():
@@ -135,8 +123,6 @@ pairs = st.tuples(numbers, numbers)
 # The heading is read from a quaternion.
 poses = st.tuples(numbers, numbers, st.sampled_from([0.0, 0.5, -3.0, math.pi]))
 spreads = st.tuples(*[numbers] * 9)
-some = operator.itemgetter(0, 1, 2, 3)
-frames = st.just('')
 WRITTEN = [
     (TWIST, Twist(), st.builds(Command, pairs)),
     (TWIST_STAMPED, TwistStamped(), st.builds(Command, pairs, times)),
@@ -163,7 +149,7 @@ WRITTEN = [
 @pytest.mark.parametrize(
     ('codec', 'template', 'values'), WRITTEN, ids=lambda one: getattr(one, 'type_name', '')
 )
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(data=st.data())
 def test_what_is_written_is_read_again(codec, template, values, data):
     value = data.draw(values)
@@ -224,19 +210,18 @@ def test_values_of_parameters_are_those_of_rclpy():
         value_of(PARAMETER_EVENT, event)
 
 
-@settings(max_examples=50, deadline=None)
-@given(values=st.lists(st.floats(), min_size=6, max_size=6))
-def test_a_twist_is_read_if_it_is_plausible(values):
-    message = Twist()
-    names = [(part, axis) for part in ('linear', 'angular') for axis in 'xyz']
-    for (part, axis), value in zip(names, values, strict=True):
-        setattr(getattr(message, part), axis, value)
-    read = TWIST.reader(Twist)
-    if all(map(math.isfinite, values)) and max(abs(values[0]), abs(values[5])) <= 1e3:
-        assert read(serialize_message(message)) == Command((values[0], values[5]))
-    else:
-        with pytest.raises(MessageError, match='twist must be'):
-            read(serialize_message(message))
+@pytest.mark.parametrize('extreme', [math.nan, math.inf, 1000.5, 1e3, -1e3])
+def test_a_twist_is_read_if_it_is_plausible(extreme):
+    """Of the components that a differential drive cannot follow only that they are finite."""
+    for place in range(6):
+        values = [0.25] * 6
+        values[place] = extreme
+        data = b'\0\1\0\0' + struct.pack('<6d', *values)
+        if math.isfinite(extreme) and (abs(extreme) <= 1e3 or place not in (0, 5)):
+            assert TWIST.reader(Twist)(data) == Command((values[0], values[5]))
+        else:
+            with pytest.raises(MessageError, match='twist must be'):
+                TWIST.reader(Twist)(data)
 
 
 def test_components_whose_sum_overflows_are_finite():
@@ -312,14 +297,8 @@ def test_twists_that_are_published_are_those_of_rclpy_byte_for_byte():
 
 
 def test_laws_of_other_packages_receive_arrays():
-    seen = []
-
     def law(pose, goal, kp, kv):
-        seen.append((pose, goal))
-        return 0.0, 0.0
+        return (goal - pose)[:2].tolist()
 
-    Controller(name='own', law=law).bind(GoToGoalParameters())((1.0, 2.0, 0.5), (3.0, 4.0, 0.0))
-    ((pose, goal),) = seen
-    assert isinstance(pose, np.ndarray)
-    assert isinstance(goal, np.ndarray)
-    assert (pose.tolist(), goal.tolist()) == ([1.0, 2.0, 0.5], [3.0, 4.0])
+    bound = Controller(name='own', law=law).bind(GoToGoalParameters())
+    assert tuple(bound((1.0, 2.0, 0.5), (3.0, 4.5, 0.0))) == (2.0, 2.5)
