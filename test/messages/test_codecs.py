@@ -298,7 +298,7 @@ def test_twists_that_are_published_are_those_of_rclpy_byte_for_byte():
 
 def test_laws_of_other_packages_receive_arrays():
     def law(pose, goal, kp, kv):
-        return (goal - pose)[:2].tolist()
+        return (goal - pose[:2]).tolist()
 
     bound = Controller(name='own', law=law).bind(GoToGoalParameters())
     assert tuple(bound((1.0, 2.0, 0.5), (3.0, 4.5, 0.0))) == (2.0, 2.5)
