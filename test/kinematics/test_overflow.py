@@ -103,10 +103,9 @@ def test_jacobians_of_any_size_are_inverted_or_refused(rows, scale):
         assert true_or_refused(result, usual(), atol=1e-12) or scale > 1e152
 
 
-@pytest.mark.parametrize('scale', [1e-305, 1e-151])
-@pytest.mark.parametrize('rows', [1, 2, 3])
-def test_jacobians_whose_squares_underflow_count_as_zero(rows, scale):
-    J, x_dot, wish = scale * J3[:rows] / 10.0, np.ones(rows), np.array([1.0, -2.0, 0.5])
+@pytest.mark.parametrize('rows', [2, 3])
+def test_jacobians_whose_squares_underflow_count_as_zero(rows):
+    J, x_dot, wish = 1e-152 * J3[:rows], np.ones(rows), np.array([1.0, -2.0, 0.5])
     for damping in (0.0, 1e-3):
         assert not iv.damped_least_squares(J, x_dot, damping).any()
         np.testing.assert_array_equal(iv.redundant(J, x_dot, wish, damping), wish)
