@@ -25,7 +25,6 @@ from diffdrive_jacobian.numerics.fields import (
     boolean,
     instance,
     integer,
-    interval,
     mapping,
     one_of,
     optional,
@@ -117,7 +116,8 @@ def test_a_name_for_type_checkers_declares_no_check():
         (between(0.0, 1.0), (), (True, '1'), 'a number'),
         (between(0.0, 1.0, above=0.0, unit='m'), (1e-300, 1), (0.0, 2), 'in (0, 1] m'),
         (between(0.1), (0.1, 1e300), (np.inf, 10**5000), 'finite and at least 0.1'),
-        (between(0, 9, above=3), (4,), (3, 10**5000), 'in (3, 9]'),
+        (between(0, 2**63 - 1, above=3), (4,), (3, 10**5000), 'in (3, 9223372036854775807]'),
+        (between(-1e6, 1e6), (), (2e6,), 'in [-1e+06, 1e+06]'),
         (boolean, (True, False), (1,), 'True or False'),
         (mapping, ({},), ([],), 'a map'),
         (sequence, ([],), ({},), 'a list'),
@@ -135,31 +135,21 @@ def test_checks_that_need_no_numpy(check, valid, invalid, allowed):
             check('x', value)
 
 
-def test_ranges_in_words_keep_integers():
-    assert interval(0, 2**63 - 1) == 'in [0, 9223372036854775807]'
-    assert interval(-1e6, 1e6) == 'in [-1e+06, 1e+06]'
-
-
 # --- Values with arrays
 
-CASES = [(VelocityLimits, 'max_v'), (VelocityLimits, 'max_wheel_speed'), (Arrival, 'offset')]
+CASES = [(VelocityLimits, 'max_v'), (Arrival, 'offset')]
 
 
 @pytest.mark.parametrize(('cls', 'name'), CASES)
 def test_values_with_arrays_are_equal_where_their_entries_are(cls, name):
-    value = cls(**{name: [0.25, 0.5]})
-    for same in (cls(**{name: (0.25, 0.5)}), cls(**{name: np.array([0.25, 0.5])})):
+    value = cls(**{name: [0.25, 0.0]})
+    for same in (cls(**{name: (0.25, 0.0)}), cls(**{name: np.array([0.25, -0.0])})):
         assert (value, hash(value)) == (same, hash(same))
-    for other in ([0.25, 0.75], [[0.25, 0.5]], [0.25], 0.25):
+    for other in ([0.25, 0.75], [[0.25, 0.0]], [0.25], 0.25):
         assert value != cls(**{name: other})
     assert value != 0.25
     number, array = cls(**{name: 0.25}), cls(**{name: np.array(0.25)})
     assert (number, hash(number)) == (array, hash(array))
-
-
-def test_signed_zeros_are_equal_and_so_are_their_hashes():
-    positive, negative = VelocityLimits(min_v=[0.0, -1.0]), VelocityLimits(min_v=[-0.0, -1.0])
-    assert (positive, hash(positive)) == (negative, hash(negative))
 
 
 def test_models_are_compared_by_their_limits_which_are_those_of_one_robot():

@@ -88,10 +88,12 @@ def assert_same(actual, expected):
 def test_near_starts_converge_by_every_method(arm, heading, method):
     task = Task(arm, heading=heading)
     q = task.bent(30)
-    target = task.forward(q)
-    result = task.solve(target, task.near(q), method=method, max_iterations=5000)
+    target, q0 = task.forward(q), task.near(q)
+    q0[0] = q[0]
+    result = task.solve(target, q0, method=method, max_iterations=5000)
     assert result.converged.all()
-    assert np.all(result.iterations >= 1)
+    assert result.iterations[0] == result.error[0] == 0
+    assert np.all(result.iterations[1:] >= 1)
     assert np.all(result.error <= TOLERANCE)
     reached = task.forward(result.q)
     difference = pose_difference(target, reached) if heading else target - reached
@@ -105,28 +107,6 @@ def test_levenberg_marquardt_converges_from_anywhere(damping):
     assert result.converged.all()
     assert np.median(result.iterations) < 30
     assert result.iterations.max() < 100
-
-
-@pytest.mark.parametrize(
-    ('method', 'tolerance'), [('newton', 1e-9), ('levenberg_marquardt', 1e-9), ('transpose', 1e-2)]
-)
-def test_a_target_at_the_rim_is_reached(method, tolerance):
-    # There the Jacobian is singular in the direction that is left to go.
-    result = Task(THREE).solve([2.1, 0.0], [0.3, -0.5, 0.4], method=method, tolerance=tolerance)
-    assert result.converged
-    np.testing.assert_allclose(result.q, 0.0, atol=3.0 * math.sqrt(tolerance))
-
-
-@every_method
-def test_at_the_target_there_is_nothing_to_do(method):
-    task = Task(THREE)
-    q0 = task.bent(5)
-    result = task.solve(task.forward(q0), q0, method=method)
-    assert result.converged.all()
-    assert not result.iterations.any()
-    assert np.array_equal(result.q, q0)
-    assert not result.error.any()
-    assert task.derived == []
 
 
 # --- The steps of documents C and D
@@ -189,19 +169,6 @@ def test_newton_may_get_worse_and_returns_the_best_it_saw():
     assert not last.converged.any()
 
 
-def test_transpose_is_sensitive_to_alpha():
-    task, q = Task(TWO), np.array([0.4, 1.1])
-    target = task.forward(q[np.newaxis])[0]
-    bound = 2.0 / np.linalg.norm(TWO.jacobian(q), ord=2) ** 2
-    options = {'method': 'transpose', 'max_iterations': 60, 'restarts': 0}
-    slow, right, wild = (
-        task.solve(target, q + 0.01, alpha=share * bound, **options) for share in (0.05, 0.9, 1.1)
-    )
-    assert slow.error > 100.0 * right.error
-    # Beyond the bound it leaves the target however near it starts.
-    assert wild.error > 100.0 * right.error
-
-
 # --- What makes no difference
 
 
@@ -261,21 +228,6 @@ def test_the_result_is_the_same(variant, method):
     assert_same(variant(task, target, task.bent(8), **options), usual)
 
 
-@pytest.mark.parametrize(('method', 'damping'), [('newton', 1.0), ('levenberg_marquardt', 1e-19)])
-def test_joints_may_have_other_units(method, damping):
-    # A slide in nm, and an arm on it that cannot help in this direction.
-    def forward(q):
-        return np.stack([1e-9 * q[:, 0] + 0.3 * np.cos(q[:, 1]), 0.3 * np.sin(q[:, 1])], axis=-1)
-
-    def jacobian(q):
-        slide = np.broadcast_to([1e-9, 0.0], (len(q), 2))
-        return np.stack([slide, 0.3 * np.stack([-np.sin(q[:, 1]), np.cos(q[:, 1])], axis=-1)], axis=-1)
-
-    result = solve(forward, jacobian, [0.8, 0.0], [0.0, 0.0], method=method, damping=damping)
-    assert result.converged
-    np.testing.assert_allclose(result.q, [0.5e9, 0.0], rtol=1e-5)
-
-
 # --- Headings and weights
 
 
@@ -298,47 +250,43 @@ def test_a_heading_takes_the_short_way_across_half_a_turn(numeric):
 
 def test_weights_say_what_matters_where_not_all_can_be_had():
     # Two joints for three entries.
-    task, q0, target = Task(TWO, heading=True), np.array([0.5, 0.5]), np.array([0.9, 0.9, 2.5])
-    off = []
+    task, target, off = Task(TWO, heading=True), np.array([0.9, 0.9, 2.5]), []
     for weight in (1e-3, 1.0, 1e3):
         m = np.array([1.0, 1.0, weight])
-        result = task.solve(target, q0, mask=m)
+        result = task.solve(target, [0.5, 0.5], mask=m)
         e = pose_difference(target, TWO.forward_kinematics(result.q))
         assert not result.converged
         assert result.error == pytest.approx(math.sqrt(e @ np.diag(m) @ e))
         downhill = TWO.jacobian(result.q, heading=True).T @ (m * e)
         assert np.abs(downhill).max() < 1e-5 * result.error * max(1.0, math.sqrt(weight))
-        off.append([np.hypot(e[0], e[1]), abs(e[2])])
-    by_position, by_heading = np.transpose(off)
-    assert by_position[0] < 2e-3 < 0.1 < by_position[1] < by_position[2]
-    assert by_heading[0] > by_heading[1] > 0.1 > 2e-3 > by_heading[2]
+        off.append([np.hypot(e[0], e[1]), -abs(e[2])])
+    assert np.all(np.diff(off, axis=0) > 0.0)
 
 
 # --- Batches
 
 
-def test_leading_axes_broadcast_and_no_target_is_no_work():
+def test_leading_axes_broadcast_a_single_target_gives_scalars_and_no_target_is_no_work():
     task = Task(THREE)
     target, q0 = task.forward(task.bent(3, 10)), task.bent(4)
     table = task.solve(target[:, None], q0)
     assert [field.shape for field in table] == [(3, 4, 3)] + [(3, 4)] * 5
-    for row, t in enumerate(target):
-        assert_same(IKResult(*(field[row] for field in table)), task.solve(t, q0))
+    assert_same(IKResult(*(field[1] for field in table)), task.solve(target[1], q0))
+    single = task.solve(target[1], q0[2], max_iterations=np.int32(500), tolerance=1e-6)
+    assert_same(IKResult(*(field[1, 2] for field in table)), single)
+    assert [np.shape(field) for field in single] == [(3,)] + [()] * 5
+    assert (single.converged.dtype, single.iterations.dtype) == (np.bool_, np.int64)
     task.asked.clear()
     none = task.solve(np.zeros((0, 4, 2)), np.zeros(3))
     assert [field.shape for field in none] == [(0, 4, 3)] + [(0, 4)] * 5
     assert task.asked == []
 
 
-def test_a_single_target_gives_scalars_and_arguments_stay_as_they_are():
+def test_arguments_stay_as_they_are():
     target, q0 = np.array([1.0, 1.0]), np.array([0.1, 0.2, 0.3])
-    result = Task(THREE).solve(target, q0)
-    assert [np.shape(field) for field in result] == [(3,)] + [()] * 5
-    assert (result.converged.dtype, result.iterations.dtype) == (np.bool_, np.int64)
-    assert target.tolist() == [1.0, 1.0]
-    assert q0.tolist() == [0.1, 0.2, 0.3]
-    at_once = Task(THREE).solve(target, q0, max_iterations=np.int32(1), tolerance=10)
-    assert at_once.converged
+    Task(THREE).solve(target, q0)
+    assert [*target, *q0] == [1.0, 1.0, 0.1, 0.2, 0.3]
+    at_once = Task(THREE).solve(target, q0, tolerance=10)
     assert not np.shares_memory(at_once.q, q0)
 
 
@@ -482,12 +430,9 @@ def test_restarts_find_what_one_search_does_not():
     assert np.count_nonzero(several.converged) >= 59
     assert not alone.restarts.any()
     # The first search is the same but for rounding, and what it finds stays.
-    by_first = several.start == 0
     np.testing.assert_allclose(several.q[alone.converged], alone.q[alone.converged], atol=1e-9)
     assert np.all(several.error <= alone.error + 1e-12)
-    np.testing.assert_allclose(several.error[by_first], alone.error[by_first], atol=1e-12)
     assert np.array_equal(several.start[several.converged], several.restarts[several.converged])
-    assert np.all(several.start <= several.restarts)
     off = pose_difference(target, task.forward(several.q))
     np.testing.assert_allclose(np.linalg.norm(off, axis=1), several.error, atol=1e-14)
 

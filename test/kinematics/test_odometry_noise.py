@@ -86,26 +86,6 @@ def test_across_a_nearly_straight_path_no_digits_are_lost():
         assert np.all(np.abs(actual - expected) <= 1e-13 * np.outer(deviations, deviations))
 
 
-def test_a_straight_path_has_the_textbook_covariance():
-    """Along the path k d / 2, in heading 2 k d / L^2, across the path d^2 / 3 of the latter."""
-    d = 0.8
-    heading = 2.0 * K * d / L**2
-    expected = [
-        [K * d / 2.0, 0.0, 0.0],
-        [0.0, heading * d**2 / 3.0, heading * d / 2.0],
-        [0.0, heading * d / 2.0, heading],
-    ]
-    close(propagated(NONE, np.zeros(3), (0.2, 0.0), 4.0), np.array(expected))
-
-
-@pytest.mark.parametrize('share', [1e-6, 0.3])
-def test_two_pieces_are_one(share):
-    halfway = propagated(COVARIANCE, START, TWISTS, share * DURATIONS)
-    pose = integrate(START, TWISTS, share * DURATIONS)
-    whole = propagated(COVARIANCE, START, TWISTS, DURATIONS)
-    close(propagated(halfway, pose, TWISTS, (1.0 - share) * DURATIONS), whole)
-
-
 def test_without_noise_the_start_is_carried_by_the_jacobian_of_the_motion():
     def reached(start):
         return integrate(start, TWISTS[:, np.newaxis], DURATIONS[:, np.newaxis])

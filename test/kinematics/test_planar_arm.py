@@ -151,34 +151,7 @@ def test_clearance_is_the_distance_of_the_nearest_of_many_points_of_the_arm():
     assert not arm.clearance_gradient([0.0, 0.0, 0.0], [0.3, 0.0]).any()  # it touches the first link
 
 
-# --- What the null space is for
-
-
 LOWER, UPPER = np.array([-1.0, -2.0, -0.5]), np.array([2.0, 1.0, 2.5])
-ARM_3 = PlanarArm([0.5, 0.4, 0.3])
-AIMS = {
-    'away from limits': (
-        lambda q: -iv.joint_limit_cost(q, LOWER, UPPER),
-        lambda q: -iv.joint_limit_gradient(q, LOWER, UPPER),
-    ),
-    'away from singularities': (
-        lambda q: iv.manipulability(ARM_3.jacobian(q)),
-        lambda q: iv.manipulability_gradient(ARM_3.jacobian, q),
-    ),
-}
-
-
-@pytest.mark.parametrize(('better', 'uphill'), AIMS.values(), ids=AIMS)
-def test_null_space_motion_does_its_secondary_task_and_leaves_the_tip(better, uphill):
-    q = start = np.random.default_rng(6).uniform([-1.0, 0.2, 0.2], [1.0, 1.0, 1.0], (10, 3))
-    for _ in range(50):
-        q_dot = iv.redundant(ARM_3.jacobian(q), np.zeros(2), uphill(q))
-        after = ARM_3.integrate(q, q_dot, 0.02)
-        tips = (ARM_3.forward_kinematics(at)[:, :2] for at in (q, after))
-        assert np.all(norm(np.subtract(*tips)) <= 2.0 * norm(0.02 * q_dot) ** 2 + 1e-15)
-        assert np.all(better(after) >= better(q) - 1e-9)
-        q = after
-    assert np.mean(better(q) - better(start)) > 3e-4
 
 
 def test_the_cost_of_joint_limits_is_zero_in_the_middle_and_an_eighth_at_the_limits():

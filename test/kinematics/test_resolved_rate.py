@@ -131,12 +131,6 @@ def test_feedback_removes_an_error_at_the_start_like_an_exponential():
     assert without.error[-1] == pytest.approx(0.02, rel=0.02)
 
 
-def test_a_line_without_length_is_over_at_once():
-    gone = track_line(ARM, [0.2, 1.0], StraightLine([1.0, 1.0], [1.0, 1.0], 1.0))
-    assert (gone.times.shape, gone.q.shape, gone.error.shape) == ((1,), (1, 2), (1,))
-    assert gone.q_dot.shape == (0, 2)
-
-
 # --- The edge of what can be reached
 
 
@@ -186,37 +180,12 @@ def test_beyond_the_edge_a_secondary_task_costs_little_and_joints_come_to_rest(s
 # --- Mobile manipulators: secondary tasks, weights, limits
 
 
-def test_a_mobile_manipulator_follows_a_line_far_beyond_the_reach_of_its_arm():
-    robot = MobileManipulator(0.033, 0.16, PlanarArm([0.3, 0.25]), (0.05, 0.0))
-    q0 = np.array([0.0, 0.0, 0.0, 0.6, -1.2])
-    line = StraightLine(robot.forward_kinematics(q0)[:2], [-0.8, 1.0], 0.4)
-    gone = track_line(robot, q0, line)
-    assert gone.q_dot.shape == (len(gone.times) - 1, 4)
-    assert gone.error.max() < 3e-3
-    assert math.dist(gone.q[-1, :2], q0[:2]) > 0.6
-    # The base only rolls.
-    heading = np.exp(-0.5j * (gone.q[1:, 2] + gone.q[:-1, 2]))
-    sideways = (np.diff(gone.q[:, :2], axis=0) @ [1.0, 1j] * heading).imag
-    wrapped = np.abs(np.diff(gone.q[:, 2])) > 1.0
-    assert np.abs(sideways[~wrapped]).max() < 1e-12
-
-
 def test_a_mobile_manipulator_reshapes_its_arm_while_the_tip_stays_on_the_line():
     alone = track_line(ROBOT, Q0, ahead(), settling=1.0, rate=50.0)
     besides = track_line(ROBOT, Q0, ahead(), secondary=reshape_the_arm, settling=1.0, rate=50.0)
     assert besides.error.max() < alone.error.max() + 0.02 < 0.1
     assert besides.error[-1] < 1e-3
     assert arms_manipulability(besides)[-1] > 1.5 * arms_manipulability(alone)[-1]
-
-
-def test_on_the_spot_the_secondary_task_only_goes_uphill_also_with_weights():
-    for weights in (None, [1.0, 3.0, 0.2, 1.0, 2.0]):
-        how = {'settling': 0.5, 'weights': weights, 'rate': 50.0}
-        run = track_line(ROBOT, Q0, ahead(by=(0.0, 0.0)), secondary=reshape_the_arm, **how)
-        growth = np.diff(arms_manipulability(run))
-        assert growth.min() > -1e-6 * growth.max()
-        assert growth.sum() > 0.005
-        assert run.error.max() < 1e-3
 
 
 def test_a_batch_of_robots_and_lines_is_followed_as_each_alone():
