@@ -302,6 +302,7 @@ def test_what_is_done_costs_nothing(method):
     assert sizes[0] == 100
     assert sizes == sorted(sizes, reverse=True)
     assert sum(sizes) == 100 + result.iterations.sum()
+    assert min(sizes) > 0
     # A step that is taken back needs no Jacobian, nor does the last one. Late steps of LM need those at
     # both sides of each joint, too.
     late = np.maximum(result.iterations - 10, 0).sum() if method == 'levenberg_marquardt' else 0
@@ -311,30 +312,28 @@ def test_what_is_done_costs_nothing(method):
 # --- Functions that fail
 
 
-@pytest.mark.parametrize('method', DOWNHILL)
+@every_method
 @pytest.mark.parametrize(
     ('which', 'bad'), [('forward', -np.inf), ('jacobian', np.nan), ('difference', np.nan)]
 )
 def test_what_is_not_finite_ends_its_own_target_only(which, bad, method):
     task = Task(TWO)
 
-    def spoiled(name, pose, value):
+    def spoiled(name, q, value):
         """Left of the base this function fails, if only in its last row or column."""
-        assert np.isfinite(pose).all()
         if name == which:
-            value[pose[:, 0] < 0.0, ..., -1] = bad
-        elif name == 'jacobian':
-            assert np.all(pose[:, 0] >= 0.0)  # nobody needs it elsewhere
+            value[TWO.forward_kinematics(q)[:, 0] < 0.0, ..., -1] = bad
         return value
 
     def forward(q):
-        return spoiled('forward', task.forward(q), task.forward(q))
+        assert np.isfinite(q).all()
+        return spoiled('forward', q, task.forward(q))
 
     def jacobian(q):
-        return spoiled('jacobian', task.forward(q), task.jacobian(q))
+        return spoiled('jacobian', q, task.jacobian(q))
 
     def difference(target, pose):
-        return spoiled('difference', pose, target - pose)
+        return spoiled('difference', task.asked[-1], target - pose)
 
     target, q0 = task.forward(task.bent(60)), task.anywhere(60, 1)
     options = {'method': method, 'max_iterations': 60}
@@ -344,8 +343,6 @@ def test_what_is_not_finite_ends_its_own_target_only(which, bad, method):
     assert not result.iterations[lost].any()
     # Where only the derivative fails, the error is known.
     assert np.array_equal(np.isfinite(result.error), ~lost | (which == 'jacobian'))
-    off = np.linalg.norm(target - task.forward(result.q), axis=1)
-    np.testing.assert_allclose(result.error[~lost], off[~lost], atol=1e-14)
     # Some come to where it fails, and those that do not see nothing of it.
     assert np.any(~lost & ~result.converged & (result.iterations < 60))
     assert np.count_nonzero(result.converged) > 5

@@ -231,22 +231,6 @@ def tasks_in_conflict(rng, n=4):
     return [(J, rng.normal(size=(COUNT, J.shape[1]))) for J in jacobians]
 
 
-def test_tasks_that_nearly_conflict_stay_slow_and_do_not_jump():
-    def q_dot(d):
-        J = np.ones(np.shape(d))[..., np.newaxis, np.newaxis] * [[1.0, 0.0, 0.0]]
-        J[..., 0, 1] = d
-        return iv.prioritized([([[1.0, 0.0, 0.0]], [1.0]), (J, [0.0])], damping=0.1)
-
-    conflict = np.concatenate([[0.0], np.logspace(-12.0, 0.0, 301)])
-    found = q_dot(conflict)
-    assert norm(found).max() <= 1.0 / 0.2 + 1.0
-    assert norm(q_dot(1e-8) - q_dot(0.0)) < 1e-5
-    assert norm(iv.prioritized([([[1.0, 0.0, 0.0]], [1.0]), ([[1.0, 1e-8, 0.0]], [0.0])])) > 1e7
-    # Derived: d / (d^2 + lambda^2) of what the second task lacks, which is -x of the first.
-    lacks = -1.0 / (1.0 + 0.1**2)
-    np.testing.assert_allclose(found[:, 1], lacks * conflict / (conflict**2 + 0.01), atol=1e-12)
-
-
 def test_each_task_contributes_a_bounded_velocity_and_leaves_those_before_it_almost_alone():
     rng = np.random.default_rng(6)
     tasks, damping = tasks_in_conflict(rng), 10.0 ** rng.uniform(-3.0, 0.0, COUNT)

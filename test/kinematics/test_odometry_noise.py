@@ -1,14 +1,15 @@
-"""The covariance of odometry: the integral along the arc, by quadrature and by noisy wheels."""
+"""The covariance of odometry: the integral along the arc, by quadrature.
+
+That noisy wheels have it, test/simulation/test_exact_moments.py shows.
+"""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 import pytest
 
 from diffdrive_jacobian.kinematics.diff_drive import unicycle_jacobian
-from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
+from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance, twist_covariance
 
 L, K = 0.16, 1e-5
@@ -101,43 +102,6 @@ def test_the_twist_covariance_is_the_density_over_the_interval():
     for twist in ((0.3, 0.0), (-0.3, 1.0), (0.0, 2.0), (0.1, -4.0)):
         actual = twist_covariance(twist, L, K, 0.02)
         np.testing.assert_allclose(actual, spectral_density(*twist) / 0.02, rtol=1e-13, atol=1e-18)
-
-
-def assert_same_within_sampling_error(samples, expected):
-    """Compare each entry of the covariance of whitened samples with the identity.
-
-    Of n Gaussian samples the entries have standard errors sqrt(2/n) on and sqrt(1/n) off the diagonal,
-    the means sqrt(1/n). Five of them are allowed: 1 seed in 10^5 would fail by chance.
-    """
-    count, size = samples.shape
-    whitened = np.linalg.solve(np.linalg.cholesky(expected), samples.T)
-    error = np.sqrt((1.0 + np.eye(size)) / count)
-    assert np.all(np.abs(np.cov(whitened) - np.eye(size)) < 5.0 * error)
-    assert np.all(np.abs(whitened.mean(axis=1)) < 5.0 / math.sqrt(count))
-
-
-@pytest.mark.parametrize('arc', [(0.2, 0.7, 5.0), (0.05, -3.0, 3.0)])
-def test_five_thousand_noisy_wheels_have_the_reported_covariances(arc):
-    """Each wheel's travel is perturbed in 50 sub-steps by a variance of k times its distance.
-
-    k is so small that the motion is linear in the noise to 1e-4 of it, far below the sampling error.
-    """
-    (v, omega, duration), count, steps, k = arc, 5_000, 50, 1e-9
-    rng = np.random.default_rng(2)
-    travel = np.array([v + omega * L / 2.0, v - omega * L / 2.0]) * duration
-    poses = START + rng.multivariate_normal(np.zeros(3), 1e-4 * COVARIANCE, count)
-    means = np.zeros((count, 2))
-    for _ in range(steps):
-        noise = np.sqrt(k * np.abs(travel) / steps) * rng.normal(size=(count, 2))
-        right, left = (travel / steps + noise).T
-        moved = np.column_stack([(right + left) / 2.0, (right - left) / L])
-        poses = integrate(poses, moved, 1.0)
-        means += moved / duration
-    deviations = poses - integrate(START, (v, omega), duration)
-    deviations[:, 2] = wrap_angle(deviations[:, 2])
-    expected = propagated(1e-4 * COVARIANCE, START, (v, omega), duration, k)
-    assert_same_within_sampling_error(deviations, expected)
-    assert_same_within_sampling_error(means - [v, omega], twist_covariance((v, omega), L, k, duration))
 
 
 @pytest.mark.parametrize(
