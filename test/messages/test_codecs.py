@@ -15,8 +15,8 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
-from support.lockstep_nodes import change, make
-from support.ros_messages import goal, goals, odometry, path, pose_of, twist, value_of
+from support.lockstep_nodes import make
+from support.ros_messages import goal, goals, odometry, path, pose_of, value_of
 
 from diffdrive_jacobian.bags.message_definitions import (
     is_known,
@@ -84,26 +84,6 @@ def test_a_command_of_a_big_endian_machine_is_followed(lockstep):
     lockstep.node.create_publisher(Twist, 'cmd_vel', 10).publish(data)
     lockstep.settle()
     assert (applied[-1].twist.linear.x, applied[-1].twist.angular.z) == (0.5, -0.25)
-
-
-def test_names_change_with_the_parameters(lockstep):
-    odom, states = lockstep.listen(Odometry, 'odom'), lockstep.listen(JointState, 'joint_states')
-    applied = lockstep.listen(TwistStamped, 'cmd_vel_out')
-    robot = lockstep.add(make(VirtualRobot))
-    names = {'odom_frame_id': 'odom', 'base_frame_id': 'base_link'}
-    names |= {'left_wheel_name': 'left_wheel_joint', 'right_wheel_name': 'right_wheel_joint'}
-    for changes in (
-        {},
-        {'odom_frame_id': 'Ö', 'base_frame_id': 'ein längerer Name'},
-        {'left_wheel_name': 'l', 'right_wheel_name': 'räder rechts'},
-    ):
-        assert not changes or change(robot, **changes).successful
-        names |= changes
-        lockstep.publish('cmd_vel', twist(0.5, 0.25))
-        lockstep.run_for(0.05)
-        frames = odom[-1].header.frame_id, odom[-1].child_frame_id
-        assert [*frames, *states[-1].name] == list(names.values())
-        assert applied[-1].header.frame_id == names['base_frame_id']
 
 
 def test_the_controller_reads_frame_and_pose_of_an_odometry():
