@@ -169,7 +169,7 @@ def test_beyond_the_edge_a_secondary_task_costs_little_and_joints_come_to_rest(s
     q0 = np.array([0.3, 0.4, 0.5])
     start = ARM_3.forward_kinematics(q0)[:2]
     line = StraightLine(start, start / np.linalg.norm(start) * 1.6, 0.2)
-    how = {'threshold': 0.3, 'settling': 1.5}
+    how = {'threshold': 0.3, 'settling': 0.8}
     alone = track_line(ARM_3, q0, line, **how)
     run = track_line(ARM_3, q0, line, secondary=secondary, **how)
     assert run.error.max() < alone.error.max() + 0.3e-3
