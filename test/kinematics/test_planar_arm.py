@@ -34,19 +34,15 @@ def times(matrices, vectors):
     return (matrices @ vectors[..., np.newaxis])[..., 0]
 
 
-def an_arm(n, seed=1):
-    """Give an arm, a batch of joint angles, some beyond a turn, and joint velocities."""
-    rng = np.random.default_rng(seed)
-    return (
-        PlanarArm(rng.uniform(0.1, 1.0, n)),
-        rng.uniform(-9, 9, (*BATCH, n)),
-        rng.normal(size=(*BATCH, n)),
-    )
+def an_arm(n):
+    """Return an arm, a batch of joint angles, some beyond a turn, and joint velocities."""
+    rng = np.random.default_rng(1)
+    q, q_dot = rng.uniform(-9.0, 9.0, (*BATCH, n)), rng.normal(size=(*BATCH, n))
+    return PlanarArm(rng.uniform(0.1, 1.0, n)), q, q_dot
 
 
-def a_robot(n, seed=2):
-    arm, joints, rates = an_arm(n, seed)
-    rng = np.random.default_rng(seed)
+def a_robot(n):
+    (arm, joints, rates), rng = an_arm(n), np.random.default_rng(2)
     robot = MobileManipulator(R, L, arm, mount=rng.uniform(-0.3, 0.3, 2))
     q = np.concatenate([rng.uniform(-3.0, 3.0, (*BATCH, 3)), joints], axis=-1)
     return robot, q, np.concatenate([rng.uniform(-9.0, 9.0, (*BATCH, 2)), rates], axis=-1)
@@ -56,18 +52,16 @@ def a_robot(n, seed=2):
 
 
 @links
-def test_the_tip_is_the_sum_of_complex_numbers_and_a_chain_of_rigid_motions(n):
+def test_the_tip_is_a_chain_of_rigid_motions_through_the_joints(n):
     arm, q, _ = an_arm(n)
-    tips = arm.lengths * np.exp(1j * np.cumsum(q, axis=-1))
-    pose, chain, positions = arm.forward_kinematics(q), np.zeros((*BATCH, 3)), [np.zeros((*BATCH, 2))]
-    close(pose[..., 0] + 1j * pose[..., 1], tips.sum(axis=-1))
+    chain, positions = np.zeros((*BATCH, 3)), [np.zeros((*BATCH, 2))]
     for angle, length in zip(np.moveaxis(q, -1, 0), arm.lengths, strict=True):
-        turned = se2.compose(chain, np.stack([0.0 * angle, 0.0 * angle, angle], axis=-1))
+        turned = se2.compose(chain, angle[..., np.newaxis] * [0.0, 0.0, 1.0])
         chain = se2.compose(turned, [length, 0.0, 0.0])
         positions.append(chain[..., :2])
-    same_pose(pose, chain)
-    assert arm.joints == n
+    same_pose(arm.forward_kinematics(q), chain)
     close(arm.joint_positions(q), np.stack(positions, axis=-2))
+    assert arm.joints == n
 
 
 @links
@@ -80,28 +74,27 @@ def test_torques_do_the_work_of_the_wrench(n):
 
 
 @two_links
-def test_two_links_by_the_adjugate_move_the_tip_as_told_and_are_singular_by_the_sine(lengths):
+def test_two_links_move_the_tip_as_told_and_are_singular_by_the_sine(lengths):
     arm, rng = PlanarArm(lengths), np.random.default_rng(4)
     q = rng.uniform([-4.0, 0.1], [4.0, 3.0], (*BATCH, 2))
     x_dot = rng.normal(size=(*BATCH, 2))
-    q_dot = arm.inverse_velocity(q, x_dot)
-    close(times(arm.jacobian(q), q_dot), x_dot, 1e-9)
+    close(times(arm.jacobian(q), arm.inverse_velocity(q, x_dot)), x_dot, 1e-9)
     close(arm.determinant(q), lengths[0] * lengths[1] * np.sin(q[..., 1]))
     close(arm.determinant(q), np.linalg.det(arm.jacobian(q)))
-    close(iv.manipulability(arm.jacobian(q)), np.abs(arm.determinant(q)))
     singular = arm.singular_configurations(q[..., 0])
-    close(singular[..., 0, :], np.stack([q[..., 0], np.zeros(BATCH)], axis=-1), 0.0)
-    close(singular[..., 1, :], np.stack([q[..., 0], np.full(BATCH, np.pi)], axis=-1), 0.0)
     close(arm.determinant(singular), 0.0)
     reach = norm(arm.forward_kinematics(singular)[..., :2])
     close(reach, np.broadcast_to(np.abs([sum(lengths), lengths[0] - lengths[1]]), reach.shape))
 
 
-@pytest.mark.parametrize('n', [1, 3, 5])
+@pytest.mark.parametrize('n', [1, 2, 5])
 def test_all_links_on_one_line_are_the_singular_configurations_of_any_arm(n):
     arm = PlanarArm(np.linspace(0.3, 0.8, n))
     q = arm.singular_configurations([0.4, -2.0])
     assert q.shape == (2, 2 ** (n - 1), n)
+    assert np.all(q[..., 0] == [[0.4], [-2.0]])
+    assert not q[:, 0, 1:].any()  # the stretched arm first
+    assert len(np.unique(q[0], axis=0)) == 2 ** (n - 1)
     close(iv.manipulability(arm.jacobian(q)), 0.0)
     # Along the line nothing moves. Any bend makes the position regular.
     close(np.einsum('abmn,am->abn', arm.jacobian(q), [[np.cos(a), np.sin(a)] for a in (0.4, -2.0)]), 0.0)
@@ -111,27 +104,26 @@ def test_all_links_on_one_line_are_the_singular_configurations_of_any_arm(n):
 
 @two_links
 def test_elbow_down_and_elbow_up_put_the_tip_there_and_there_is_no_third_solution(lengths):
-    arm, rng = PlanarArm(lengths), np.random.default_rng(6)
-    q = rng.uniform([-np.pi, -np.pi], [np.pi, np.pi], (*BATCH, 2))
+    arm = PlanarArm(lengths)
+    q = np.random.default_rng(6).uniform(-np.pi, np.pi, (*BATCH, 2))
     down_up = arm.inverse_kinematics(arm.forward_kinematics(q)[..., :2])
     tips = arm.forward_kinematics(down_up)[..., :2]
-    close(tips, np.broadcast_to(arm.forward_kinematics(q)[..., np.newaxis, :2], tips.shape), 1e-12)
+    close(tips, np.broadcast_to(arm.forward_kinematics(q)[..., np.newaxis, :2], tips.shape))
     down, up = np.moveaxis(down_up, -2, 0)
     assert np.array_equal(down[..., 1], -up[..., 1])
     assert np.all(down[..., 1] >= 0.0)
-    difference = se2.wrap_angle(np.where(q[..., 1:] > 0.0, down, up) - q)
-    close(difference, 0.0, 1e-5)
+    close(se2.wrap_angle(np.where(q[..., 1:] > 0.0, down, up) - q), 0.0, 1e-5)
     # The rim, up to rounding.
     angles = np.linspace(-3.0, 3.0, 50)
     for reach in (sum(lengths), abs(lengths[0] - lengths[1])):
         rim = reach * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-        close(arm.forward_kinematics(arm.inverse_kinematics(rim)[:, 0])[:, :2], rim, 1e-12)
+        close(arm.forward_kinematics(arm.inverse_kinematics(rim)[:, 0])[:, :2], rim)
 
 
 @two_links
-def test_stretched_and_folded_arms_are_refused_after_many_turns_and_folded_the_other_way(lengths):
+def test_stretched_and_folded_arms_are_refused_also_after_many_turns(lengths):
     arm = PlanarArm(lengths)
-    for q_1 in [*np.linspace(-3.1, 3.1, 30), *np.linspace(10.0, 1000.0, 30)]:
+    for q_1 in (-3.1, 0.0, 2.5, 1000.0):
         for q_2 in (0.0, np.pi, -np.pi):
             with pytest.raises(np.linalg.LinAlgError, match=r'got a determinant of'):
                 arm.inverse_velocity([q_1, q_2], [1.0, 0.0])
@@ -146,9 +138,9 @@ def test_manipulability_of_a_nearly_stretched_arm_keeps_its_digits():
 
 def test_clearance_is_the_distance_of_the_nearest_of_many_points_of_the_arm():
     arm, rng = PlanarArm([0.5, 0.4, 0.3]), np.random.default_rng(6)
-    q, obstacle = rng.uniform(-4.0, 4.0, (200, 3)), rng.uniform(-1.5, 1.5, (200, 2))
+    q, obstacle = rng.uniform(-4.0, 4.0, (100, 3)), rng.uniform(-1.5, 1.5, (100, 2))
     joints, part = arm.joint_positions(q)[:, :, np.newaxis], np.linspace(0.0, 1.0, 1001)[:, np.newaxis]
-    points = (joints[:, :-1] + part * (joints[:, 1:] - joints[:, :-1])).reshape(200, -1, 2)
+    points = (joints[:, :-1] + part * (joints[:, 1:] - joints[:, :-1])).reshape(100, -1, 2)
     nearest = norm(points - obstacle[:, np.newaxis]).min(axis=-1)
     clearance = arm.clearance(q, obstacle)
     assert np.all(clearance <= nearest)
@@ -159,38 +151,7 @@ def test_clearance_is_the_distance_of_the_nearest_of_many_points_of_the_arm():
     assert not arm.clearance_gradient([0.0, 0.0, 0.0], [0.3, 0.0]).any()  # it touches the first link
 
 
-# --- What the null space is for
-
-
 LOWER, UPPER = np.array([-1.0, -2.0, -0.5]), np.array([2.0, 1.0, 2.5])
-
-
-@pytest.mark.parametrize('aim', ['away from singularities', 'away from limits'])
-def test_null_space_motion_does_its_secondary_task_and_leaves_the_tip(aim):
-    arm, dt = PlanarArm([0.5, 0.4, 0.3]), 0.01
-
-    def better(q):
-        if aim == 'away from limits':
-            return -iv.joint_limit_cost(q, LOWER, UPPER)
-        return iv.manipulability(arm.jacobian(q))
-
-    def wish(q):
-        if aim == 'away from limits':
-            return -iv.joint_limit_gradient(q, LOWER, UPPER)
-        return iv.manipulability_gradient(arm.jacobian, q)
-
-    def tip_moved(q, q_dot, dt):
-        here, there = (arm.forward_kinematics(at)[:, :2] for at in (q, arm.integrate(q, q_dot, dt)))
-        return norm(there - here)
-
-    q = start = np.random.default_rng(6).uniform([-1.0, 0.2, 0.2], [1.0, 1.0, 1.0], (20, 3))
-    for _ in range(100):
-        q_dot = iv.redundant(arm.jacobian(q), np.zeros(2), wish(q))
-        assert np.all(tip_moved(q, q_dot, dt) <= 2.0 * norm(dt * q_dot) ** 2 + 1e-15)
-        after = arm.integrate(q, q_dot, dt)
-        assert np.all(better(after) >= better(q) - 1e-9)
-        q = after
-    assert np.mean(better(q) - better(start)) > 3e-4
 
 
 def test_the_cost_of_joint_limits_is_zero_in_the_middle_and_an_eighth_at_the_limits():
@@ -216,8 +177,8 @@ def test_the_tip_of_a_mobile_manipulator_is_base_and_mount_and_arm(n):
 def test_one_step_is_many_and_the_base_drives_as_if_alone(n):
     robot, q, q_dot = a_robot(n)
     here = q
-    for _ in range(50):
-        here = robot.integrate(here, q_dot, 0.02)
+    for _ in range(20):
+        here = robot.integrate(here, q_dot, 0.05)
     there = robot.integrate(q, q_dot, 1.0)
     same_pose(here, there)
     close(here[..., 3:], there[..., 3:])
@@ -233,18 +194,13 @@ def test_one_step_is_many_and_the_base_drives_as_if_alone(n):
 
 
 def test_the_point_at_the_ground_stands_still_where_the_wheel_rolls():
-    r = np.array([[0.01], [R], [2.0]])
+    r, phi = np.array([[0.01], [R], [2.0]]), np.linspace(-3.0, 3.0, 7)
     rolling = contact.rolling_direction(r)
-    J = contact.wheel_contact_jacobian(contact.AT_GROUND, r)
-    assert J.shape == (3, 1, 3, 2)
-    close(times(J, rolling), 0.0, 1e-15)
+    close(times(contact.wheel_contact_jacobian(contact.AT_GROUND, r), rolling), 0.0, 1e-15)
     close(contact.wheel_contact_position(0.7, contact.AT_GROUND, r), [[[0.7, 0.0, 0.0]]] * 3, 1e-15)
-    phi = np.linspace(-3.0, 3.0, 7)
     assert norm(times(contact.wheel_contact_jacobian(phi, r), rolling)).min() > 1e-4
-    from_hub = contact.wheel_contact_position(0.7, phi, r) - np.stack(
-        [0.7 + 0.0 * r, r, 0.0 * r], axis=-1
-    )
-    close(norm(from_hub), np.broadcast_to(r, (3, 7)))
+    hub = np.stack([0.7 + 0.0 * r, r, 0.0 * r], axis=-1)
+    close(norm(contact.wheel_contact_position(0.7, phi, r) - hub), np.broadcast_to(r, (3, 7)))
     top = contact.wheel_contact_jacobian(0.0, r) @ np.array([0.0, 1.0])
     close(top[..., 0], r)  # forward, for phi turns as the wheel rolls
 
@@ -257,17 +213,11 @@ ARM, LONG = PlanarArm([0.3, 0.2]), PlanarArm([1.0] * 3)
 @pytest.mark.parametrize(
     ('message', 'call'),
     [
-        ('lengths must have shape', lambda: PlanarArm([])),
-        ('lengths must be positive', lambda: PlanarArm([1.0, 0.0])),
-        ('q must have shape', lambda: ARM.jacobian([0.0])),
         ('determinant is for an arm of 2 links, .* 3$', lambda: LONG.determinant([0.0] * 3)),
         ('inverse_kinematics is for an arm of 2 links', lambda: LONG.inverse_kinematics([0.1, 0.2])),
         ('inverse_velocity is for an arm of 2', lambda: LONG.inverse_velocity([0.0] * 3, [0.0, 1.0])),
         ('wrench must have shape', lambda: ARM.joint_torques([0.0] * 2, [0.0] * 4)),
-        ('mount must have shape', lambda: MobileManipulator(R, L, ARM, [[0.0, 0.0]])),
-        ('r must be positive', lambda: MobileManipulator(-R, L, ARM)),
-        ('L must be a single number', lambda: MobileManipulator(R, [L, L], ARM)),
-        ('arm must be', lambda: MobileManipulator(R, L, None)),
+        ('lengths must be positive', lambda: PlanarArm([1.0, 0.0])),
         ('r must be positive', lambda: contact.rolling_direction([1.0, 0.0])),
         ('d must .* rank 1', lambda: dd.offset_point_jacobian(0.0, R, L, [1.0, 0.0])),
         *(

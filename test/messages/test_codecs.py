@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import operator
 import struct
 
-import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
 from hypothesis import given, settings
@@ -15,15 +13,13 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
-from support.lockstep_nodes import change, make
-from support.ros_messages import goal, goals, joint_command, odometry, path, pose_of, twist, value_of
+from support.lockstep_nodes import make
+from support.ros_messages import goal, goals, odometry, path, pose_of, value_of
 
 from diffdrive_jacobian.bags.message_definitions import (
     is_known,
-    known_definition,
     known_structure,
     message_class,
 )
@@ -49,7 +45,6 @@ from diffdrive_jacobian.messages.codecs import (
     stamp_of,
 )
 from diffdrive_jacobian.messages.conversion import MessageError, from_twist
-from diffdrive_jacobian.messages.structure import structure
 from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -58,12 +53,10 @@ from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 
 INPUTS = [
     (VirtualRobot, {}, Twist, 'cmd_vel'),
-    (VirtualRobot, {'enable_stamped_cmd_vel': True}, TwistStamped, 'cmd_vel'),
     (VirtualRobot, {'command_interface': 'wheels'}, JointState, 'joint_command'),
     (VirtualRobot, {}, PoseWithCovarianceStamped, 'initialpose'),
     (GoToGoal, {}, Odometry, 'odom'),
     (GoToGoal, {}, PoseStamped, 'goal_pose'),
-    (WheelBridge, {}, Twist, 'cmd_vel'),
     (WheelBridge, {'enable_stamped_cmd_vel': True}, TwistStamped, 'cmd_vel'),
 ]
 
@@ -75,7 +68,7 @@ def test_bytes_that_are_no_message_are_dropped_and_named(
     lockstep.add(make(node_class, **parameters))
     publisher = lockstep.node.create_publisher(message_class, topic, 10)
     valid = serialize_message(message_class())
-    for data in (b'', valid[:3], valid[:-12], b'\0\1\0\0' + b'\xff' * 40, b'\1\2' + valid[2:]):
+    for data in (b'', valid[:-12], b'\0\1\0\0' + b'\xff' * 40, b'\1\2' + valid[2:]):
         publisher.publish(data)
         lockstep.settle()
     # The log is throttled, and the node goes on.
@@ -84,41 +77,13 @@ def test_bytes_that_are_no_message_are_dropped_and_named(
     lockstep.run_for(0.1)
 
 
-def big_endian(message):
-    """Serialize a message of doubles only, in the other byte order."""
-    data = serialize_message(message)
-    count = (len(data) - 4) // 8
-    return b'\0\0\0\0' + struct.pack(f'>{count}d', *struct.unpack_from(f'<{count}d', data, 4))
-
-
 def test_a_command_of_a_big_endian_machine_is_followed(lockstep):
     applied = lockstep.listen(TwistStamped, 'cmd_vel_out')
     lockstep.add(make(VirtualRobot))
-    lockstep.node.create_publisher(Twist, 'cmd_vel', 10).publish(big_endian(twist(0.5, -0.25)))
+    data = b'\0\0\0\0' + struct.pack('>6d', 0.5, 0.0, 0.0, 0.0, 0.0, -0.25)
+    lockstep.node.create_publisher(Twist, 'cmd_vel', 10).publish(data)
     lockstep.settle()
     assert (applied[-1].twist.linear.x, applied[-1].twist.angular.z) == (0.5, -0.25)
-
-
-def test_names_change_with_the_parameters(lockstep):
-    odom, states = lockstep.listen(Odometry, 'odom'), lockstep.listen(JointState, 'joint_states')
-    applied = lockstep.listen(TwistStamped, 'cmd_vel_out')
-    robot = lockstep.add(make(VirtualRobot))
-    names = {'odom': 'odom', 'base': 'base_link', 'wheels': ['left_wheel_joint', 'right_wheel_joint']}
-    for changes in (
-        {},
-        {'odom_frame_id': 'Ö', 'base_frame_id': 'ein längerer Name'},
-        {'left_wheel_name': 'l', 'right_wheel_name': 'räder rechts'},
-    ):
-        assert not changes or change(robot, **changes).successful
-        names['odom'] = changes.get('odom_frame_id', names['odom'])
-        names['base'] = changes.get('base_frame_id', names['base'])
-        if 'left_wheel_name' in changes:
-            names['wheels'] = [changes['left_wheel_name'], changes['right_wheel_name']]
-        lockstep.publish('cmd_vel', twist(0.5, 0.25))
-        lockstep.run_for(0.05)
-        assert (odom[-1].header.frame_id, odom[-1].child_frame_id) == (names['odom'], names['base'])
-        assert applied[-1].header.frame_id == names['base']
-        assert list(states[-1].name) == names['wheels']
 
 
 def test_the_controller_reads_frame_and_pose_of_an_odometry():
@@ -135,8 +100,6 @@ pairs = st.tuples(numbers, numbers)
 # The heading is read from a quaternion.
 poses = st.tuples(numbers, numbers, st.sampled_from([0.0, 0.5, -3.0, math.pi]))
 spreads = st.tuples(*[numbers] * 9)
-some = operator.itemgetter(0, 1, 2, 3)
-frames = st.just('')
 WRITTEN = [
     (TWIST, Twist(), st.builds(Command, pairs)),
     (TWIST_STAMPED, TwistStamped(), st.builds(Command, pairs, times)),
@@ -163,7 +126,7 @@ WRITTEN = [
 @pytest.mark.parametrize(
     ('codec', 'template', 'values'), WRITTEN, ids=lambda one: getattr(one, 'type_name', '')
 )
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(data=st.data())
 def test_what_is_written_is_read_again(codec, template, values, data):
     value = data.draw(values)
@@ -185,34 +148,6 @@ def test_every_codec_is_of_a_type_that_bags_are_read_with():
             assert is_known(codec.type_name)
 
 
-FILLED = [
-    joint_command(2.0, 3.0, 2_500_000_000),
-    goals(goal(1, 2, 0.5, frame='Karte ä'), goal(2, 0), stamp=3),
-    odometry(1.0, -2.0, 0.5),
-    Float64MultiArray(data=[1.0, 2.0]),
-    ParameterEvent(
-        node='/a',
-        new_parameters=[Parameter('ä', value=value).to_parameter_msg() for value in (0.5, 'x', [1, 2])],
-        changed_parameters=[Parameter('b', value=[b'\1', b'\2']).to_parameter_msg()],
-    ),
-]
-
-
-@pytest.mark.parametrize('message', FILLED, ids=lambda message: type(message).__name__)
-def test_both_byte_orders_are_read(message):
-    name = structure(type(message)).name.replace('/', '/msg/')
-    codec = next(one for topic in TOPICS.values() for one in topic.codecs if one.type_name == name)
-    little, store = serialize_message(message), get_typestore(Stores.ROS2_JAZZY)
-    store.register(get_types_from_msg(known_definition(GOALS.type_name).text, GOALS.type_name))
-    kind = store.get_msgdef(name)
-    # `deserialize_cdr` refuses the bytes that Fast CDR appends to some messages.
-    decoded, _ = kind.deserialize_cdr_le(memoryview(little)[4:], 0, kind.cls, store)
-    big = bytes(store.serialize_cdr(decoded, name, little_endian=False))
-    read = codec.reader(known_structure(name))
-    assert big[:2] == b'\0\0'
-    assert read(big) == read(little) == codec.reader(type(message))(big)
-
-
 def test_values_of_parameters_are_those_of_rclpy():
     values = [None, True, -3, 0.5, 'ä', [b'\0', b'\xff'], [True, False], [1, -2], [0.5], ['', 'x']]
     parameters = [Parameter(str(kind), Parameter.Type(kind), one) for kind, one in enumerate(values)]
@@ -224,19 +159,18 @@ def test_values_of_parameters_are_those_of_rclpy():
         value_of(PARAMETER_EVENT, event)
 
 
-@settings(max_examples=50, deadline=None)
-@given(values=st.lists(st.floats(), min_size=6, max_size=6))
-def test_a_twist_is_read_if_it_is_plausible(values):
-    message = Twist()
-    names = [(part, axis) for part in ('linear', 'angular') for axis in 'xyz']
-    for (part, axis), value in zip(names, values, strict=True):
-        setattr(getattr(message, part), axis, value)
-    read = TWIST.reader(Twist)
-    if all(map(math.isfinite, values)) and max(abs(values[0]), abs(values[5])) <= 1e3:
-        assert read(serialize_message(message)) == Command((values[0], values[5]))
-    else:
-        with pytest.raises(MessageError, match='twist must be'):
-            read(serialize_message(message))
+@pytest.mark.parametrize('extreme', [math.nan, math.inf, 1000.5, 1e3, -1e3])
+def test_a_twist_is_read_if_it_is_plausible(extreme):
+    """Of the components that a differential drive cannot follow only that they are finite."""
+    for place in range(6):
+        values = [0.25] * 6
+        values[place] = extreme
+        data = b'\0\1\0\0' + struct.pack('<6d', *values)
+        if math.isfinite(extreme) and (abs(extreme) <= 1e3 or place not in (0, 5)):
+            assert TWIST.reader(Twist)(data) == Command((values[0], values[5]))
+        else:
+            with pytest.raises(MessageError, match='twist must be'):
+                TWIST.reader(Twist)(data)
 
 
 def test_components_whose_sum_overflows_are_finite():
@@ -302,24 +236,9 @@ def test_wheels_are_left_right_in_messages_and_right_left_in_the_library(angles)
     )
 
 
-def test_twists_that_are_published_are_those_of_rclpy_byte_for_byte():
-    message = twist(0.125, -3.5)
-    assert TWIST.writer(Twist())(Command((0.125, -3.5))) == serialize_message(message)
-    data = TWIST_STAMPED.writer(TwistStamped())(Command((0.125, -3.5), 7_000_000_008))
-    expected = TwistStamped(twist=message)
-    expected.header.stamp.sec, expected.header.stamp.nanosec = 7, 8
-    assert deserialize_message(data, TwistStamped) == expected
-
-
 def test_laws_of_other_packages_receive_arrays():
-    seen = []
-
     def law(pose, goal, kp, kv):
-        seen.append((pose, goal))
-        return 0.0, 0.0
+        return (goal - pose[:2]).tolist()
 
-    Controller(name='own', law=law).bind(GoToGoalParameters())((1.0, 2.0, 0.5), (3.0, 4.0, 0.0))
-    ((pose, goal),) = seen
-    assert isinstance(pose, np.ndarray)
-    assert isinstance(goal, np.ndarray)
-    assert (pose.tolist(), goal.tolist()) == ([1.0, 2.0, 0.5], [3.0, 4.0])
+    bound = Controller(name='own', law=law).bind(GoToGoalParameters())
+    assert tuple(bound((1.0, 2.0, 0.5), (3.0, 4.5, 0.0))) == (2.0, 2.5)

@@ -23,6 +23,14 @@ SUCCEEDED, CANCELED, ABORTED = ENDED
 A, B, C = (1, 0), (2, 0), (3, 0)
 
 
+ENDS = {
+    'arrival': (SUCCEEDED, Fate.SUCCEEDED),
+    'cancel': (CANCELED, Fate.CANCELED),
+    'overflow': (ABORTED, Fate.ABORTED),
+}
+EVENTS = ('goal', 'bad goal', 'odometry', *ENDS)
+
+
 class Controller:
     """What a controller does with its goals, 0, 1, 2, ..., and which statuses it publishes."""
 
@@ -50,12 +58,8 @@ class Controller:
             if event == 'odometry' and not self.executing:
                 self.executing = True
                 self.published.append((self.active, EXECUTING))
-            elif event == 'arrival':
-                self._end(SUCCEEDED, Fate.SUCCEEDED)
-            elif event == 'cancel':
-                self._end(CANCELED, Fate.CANCELED)
-            elif event == 'overflow':
-                self._end(ABORTED, Fate.ABORTED)
+            elif event in ENDS:
+                self._end(*ENDS[event])
         return self.published
 
     def _end(self, state, fate):
@@ -63,29 +67,22 @@ class Controller:
         self.fates[self.active], self.active = fate, None
 
 
-EVENTS = ('goal', 'bad goal', 'odometry', 'arrival', 'cancel', 'overflow')
-
-
-def followed(events, *, stamped=True, early=False):
+def followed(events, *, stamped, early):
     """Yield a controller and the goals as followed, after each event.
 
-    Args:
-        events: What happens.
-        stamped: Whether goals have different stamps.
-        early: Whether the statuses of a goal are received before it.
+    Goals may have stamps, all different, or none; their statuses may be received before them.
     """
     controller, follower, goals = Controller(), GoalFollower(), []
     for event in events:
-        statuses = controller.take(event)
         number = len(goals)
-        stamp = (number + 1, 0) if stamped else UNSTAMPED
-        sent = 'goal' in event
+        stamps = [(goal + 1, 0) if stamped else UNSTAMPED for goal in range(number + 1)]
+        statuses, sent = controller.take(event), 'goal' in event
         if sent and not early:
-            goals.append(follower.sent(number, stamp))
+            goals.append(follower.sent(number, stamps[number]))
         for goal, state in statuses:
-            follower.reported(state, (goal + 1, 0) if stamped else UNSTAMPED)
+            follower.reported(state, stamps[goal])
         if sent and early:
-            goals.append(follower.sent(number, stamp))
+            goals.append(follower.sent(number, stamps[number]))
         yield controller, follower, goals
 
 
@@ -158,11 +155,12 @@ def test_each_change_of_a_fate_is_returned_once():
 
 def test_only_the_last_stamps_are_remembered():
     follower = GoalFollower()
-    for second in range(10 * MAX_KNOWN):
-        follower.reported(EXECUTING, (second, 0))
+    for second in range(3 * MAX_KNOWN):
         follower.sent(second, (second, 1))
-    assert len(follower._goals) == MAX_KNOWN
-    assert follower.reported(SUCCEEDED, (10 * MAX_KNOWN - 1, 1)) is follower.newest
+        follower.reported(EXECUTING, (second, 1))
+    newest, oldest = 3 * MAX_KNOWN - 1, 2 * MAX_KNOWN
+    for second, goal in ((oldest, oldest), (newest, newest), (oldest - 1, None)):
+        assert follower.reported(SUCCEEDED, (second, 1)).goal == goal
 
 
 def test_states_are_those_of_action_msgs_and_either_active_or_ended():
