@@ -183,21 +183,19 @@ def write_loop(path: Path, pages: int) -> Path:
     return path
 
 
-HOSTILE_SCHEMAS = {
-    'generated column': (
-        TOPIC,
-        """CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,
-            timestamp INTEGER NOT NULL, data BLOB AS (zeroblob(900000000)))""",
-        'INSERT INTO messages(id, topic_id, timestamp) VALUES (1, 1, 1)',
-    ),
-    'endless view': (
-        'DROP TABLE topics',
-        """CREATE VIEW topics AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
-            SELECT id, '/odom' AS name, 'nav_msgs/msg/Odometry' AS type, 'cdr' AS serialization_format,
-            '' AS offered_qos_profiles FROM n""",
-        MESSAGES,
-    ),
-}
+GENERATED = (
+    TOPIC,
+    """CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,
+        timestamp INTEGER NOT NULL, data BLOB AS (zeroblob(900000000)))""",
+    'INSERT INTO messages(id, topic_id, timestamp) VALUES (1, 1, 1)',
+)
+ENDLESS = (
+    'DROP TABLE topics',
+    """CREATE VIEW topics AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
+        SELECT id, '/odom' AS name, 'nav_msgs/msg/Odometry' AS type, 'cdr' AS serialization_format,
+        '' AS offered_qos_profiles FROM n""",
+    MESSAGES,
+)
 
 # --- YAML
 

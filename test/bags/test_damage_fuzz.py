@@ -102,7 +102,7 @@ PAGE = 4096
 """Size of a page of SQLite (bytes)."""
 CASES = 1
 """For each kind of file and of damage."""
-SMALL, LARGE = make_messages(60, 400), make_messages(12, 20_000)
+SMALL, LARGE = make_messages(40, 400), make_messages(8, 20_000)
 """The large ones are in several pages of SQLite each."""
 KINDS = {
     'mcap': ('mcap', CompressionMode.NONE, SMALL),
@@ -287,7 +287,7 @@ def mutate(content, chance):
 
 def test_values_of_metadata(bags, tmp_path):
     chance, yaml, results = random.Random('metadata'), YAML(typ='safe'), set()
-    for number in range(8):
+    for number in range(5):
         bag = shutil.copytree(bags[list(PLUGINS)[number % 2]], tmp_path / f'{number}' / 'bag')
         content = yaml.load((bag / 'metadata.yaml').read_text())
         mutate(content, chance)
@@ -304,7 +304,7 @@ def test_cells_of_sqlite(bags, tmp_path):
     chance, results = random.Random('cells'), set()
     cells = [one for one in VALUES if not isinstance(one, (list, dict)) and one not in (2**63, 10**30)]
     cells += [b'', b'\0', b'\0\1\0\0', b'\xff' * 40, chance.randbytes(400)]
-    for number in range(8):
+    for number in range(5):
         bag = shutil.copytree(bags['sqlite3'], tmp_path / f'{number}' / 'bag')
         with closing(sqlite3.connect(data_file(bag))) as database, database:
             for _ in range(chance.choice((2, 3, 5))):
@@ -355,7 +355,7 @@ def test_records_of_journals_with_right_checksums(tmp_path):
     # After opcode, length, times, size, checksum, compression and size of a chunk.
     inside = chunk + 49
     chance, results = random.Random('journal'), set()
-    for number in range(16):
+    for number in range(10):
         data = bytearray(whole)
         for _ in range(chance.choice((1, 1, 2, 3))):
             _, at, to = chance.choice([*outside, *mcap_records(whole, inside) * 2])
