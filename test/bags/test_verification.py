@@ -214,7 +214,8 @@ def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, driven, limit
         ActuatorLag(0.2, start=0.1, duration=0.5),
         DeadWheel('left', start=0.3, duration=0.5),
         SaturatedWheel('right', 3.5, start=0.2, duration=0.8),
-        ActuatorLag(0.1, start=0.65),
+        # At the end of the first one.
+        ActuatorLag(0.1, start=0.6),
     )
     run = driven([(0.3, (-1) ** number) for number in range(6)], 0.2)
     held(run, 1e-12)
@@ -400,6 +401,13 @@ def test_odometry_that_was_not_compared_is_counted():
     assert verification.notes == (
         '39 of 100 odometry messages precede the start of the simulated robot and were not compared',
     )
+
+
+def test_commands_that_precede_the_odometry_are_passed_over():
+    odometry = still()
+    stamps = [*(odometry.stamps[:3] - 10**9), *odometry.stamps]
+    commands = series('cmd_vel', stamps, [[1.0, 0.0]] * 3 + [[0.0, 0.0]] * 100)
+    assert verify(built_run(odometry=odometry, cmd_vel=commands)).holds(0.0, 0.0)
 
 
 # --- The covariance
