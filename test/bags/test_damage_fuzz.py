@@ -13,6 +13,7 @@ import sqlite3
 import struct
 import zlib
 from contextlib import closing, suppress
+from io import BytesIO
 
 import pytest
 from rclpy.serialization import serialize_message
@@ -41,6 +42,7 @@ from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Message, Text
 from diffdrive_jacobian.bags.recovery import Recovery, UncheckedError
 from diffdrive_jacobian.bags.run import Run
+from diffdrive_jacobian.bags.salvage import read_sqlite
 from diffdrive_jacobian.bags.timeline import commanded, limits, measured, timeline
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.parameters.declaration import ParameterError
@@ -118,7 +120,7 @@ KINDS = {
 
 @pytest.fixture(params=KINDS)
 def whole(request, tmp_path):
-    """Path of a bag or journal, its messages, and whether their bytes are in the file as they are."""
+    """Kind and path of a bag or journal, its messages, and whether their bytes are in the file."""
     storage, mode, messages = KINDS[request.param]
     path = tmp_path / 'whole' / 'run'
     path.parent.mkdir()
@@ -127,7 +129,7 @@ def whole(request, tmp_path):
     else:
         journal = write_journal(path, messages)
         path = journal if storage == 'journal' else recover(journal).bag
-    return path, messages, mode in (None, CompressionMode.NONE)
+    return request.param, path, messages, mode in (None, CompressionMode.NONE)
 
 
 def cut(data, at, chance):
@@ -195,9 +197,9 @@ def pages(data, content):
 
 
 def test_damaged_bytes(whole, tmp_path):
-    path, messages, plain = whole
+    kind, path, messages, plain = whole
     for number, how in enumerate(DAMAGE * CASES):
-        chance = random.Random(f'{path.suffix} {number}')
+        chance = random.Random(f'{kind} {number}')
         folder = tmp_path / str(number)
         folder.mkdir()
         old = (shutil.copytree if path.is_dir() else shutil.copyfile)(path, folder / path.name)
@@ -224,8 +226,24 @@ def test_damaged_bytes(whole, tmp_path):
             assert found == messages
 
 
+def test_a_changed_byte_of_a_database_alters_one_message_at_most(tmp_path):
+    messages = [('/odom', 1 + number, b'\0\1\0\0' + bytes([number]) * 3000) for number in range(12)]
+    write_bag(tmp_path / 'bag', 'sqlite3', messages)
+    data = data_file(tmp_path / 'bag').read_bytes()
+    chance, contents_of = random.Random('database'), {one[2] for one in messages}
+    page = data.rindex(messages[0][2][:9]) // PAGE * PAGE
+    for _ in range(300):
+        changed = bytearray(data)
+        # The pages of messages begin with the places of their rows, and end with these.
+        at = chance.choice((page + chance.randrange(100), chance.randrange(len(data))))
+        changed[at] ^= 1 << chance.randrange(8)
+        found = [one for one in read_sqlite(BytesIO(changed), list, list) if isinstance(one, Message)]
+        assert len(found) <= len(messages)
+        assert sum(one.data not in contents_of for one in found) <= 1
+
+
 def test_undamaged_files_without_metadata(whole, tmp_path):
-    path, messages, _ = whole
+    _, path, messages, _ = whole
     given = tmp_path / path.name
     if path.is_dir():
         given.mkdir()
@@ -297,7 +315,7 @@ def test_values_of_metadata(bags, tmp_path):
     assert results == {True, False}
 
 
-TABLES = ('topics', 'messages', 'message_definitions', 'schema', 'metadata')
+TABLES = ('topics', 'topics', 'messages', 'messages', 'message_definitions', 'schema', 'metadata')
 
 
 def test_cells_of_sqlite(bags, tmp_path):
@@ -308,7 +326,7 @@ def test_cells_of_sqlite(bags, tmp_path):
         bag = shutil.copytree(bags['sqlite3'], tmp_path / f'{number}' / 'bag')
         with closing(sqlite3.connect(data_file(bag))) as database, database:
             for _ in range(chance.choice((2, 3, 5))):
-                table = chance.choice(('topics', 'messages', *TABLES))
+                table = chance.choice(TABLES)
                 column = chance.choice(database.execute(f'PRAGMA table_info({table})').fetchall())[1]
                 (row,) = chance.choice(database.execute(f'SELECT rowid FROM {table}').fetchall())
                 change = f'UPDATE {table} SET {column} = ? WHERE rowid = ?'

@@ -1,4 +1,4 @@
-"""The journal, apart from cuts and damage, for which see `test_damage_fuzz`."""
+"""The journal: what was written comes back, and what was cut or damaged is never taken for whole."""
 
 from __future__ import annotations
 
@@ -6,19 +6,26 @@ from contextlib import closing, suppress
 from io import BytesIO
 
 import pytest
-from support.raw_bags import LATCHED, channel, mcap_records
+from support.raw_bags import LATCHED, mcap_records
 
 from diffdrive_jacobian.bags import journal, mcap
 from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
 from diffdrive_jacobian.bags.files import journal_of
-from diffdrive_jacobian.bags.journal import JournalWriter, Message, Text
+from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.salvage import Topic, read_mcap
 
 pytestmark = pytest.mark.usefixtures('quick_disk')
 
 
 def described(number, depth=10):
-    return channel(number, f'/t{number}', 'geometry_msgs/msg/Twist', (LATCHED._replace(depth=depth),))
+    return Channel(
+        id=number,
+        topic=f'/t{number}',
+        type_name='a_msgs/msg/A',
+        definition='int32 a\n',
+        type_hash='RIHS01_0',
+        qos=(LATCHED._replace(depth=depth),),
+    )
 
 
 @pytest.fixture
@@ -50,6 +57,26 @@ def read(data):
         elif isinstance(found, Message):
             messages.append(Message(names[found.channel], found.stamp, found.data))
     return messages, lost
+
+
+def test_a_cut_at_any_byte_leaves_what_precedes_it_and_any_changed_byte_is_noticed(written):
+    messages = [Message(number % 3, number, bytes(number)) for number in range(6)]
+    data, sizes = written(messages[:3], [Text('é', 'ü'), *messages[3:]])
+    ends = [end for *_, end in mcap_records(data)]
+    assert read(data) == (messages, [])
+    for cut in range(sizes[0], len(data)):
+        left, lost = read(data[:cut])
+        assert left == messages[: len(left)]
+        assert len(left) >= 3 * (cut >= sizes[1])
+        assert lost or cut in ends
+    for place in range(len(mcap.MAGIC), len(data)):
+        changed = bytearray(data)
+        changed[place] ^= 1
+        # The name or the number of a topic may be damaged, so that `read` does not know it.
+        with suppress(LookupError, ValueError):
+            left, lost = read(bytes(changed))
+            # In the header of the file, and in the times of a chunk, it does not matter.
+            assert lost or left == messages
 
 
 def test_a_chunk_that_is_missing_is_noticed(written):

@@ -1,4 +1,4 @@
-"""Names of new files, checks before they are written, and the directory in which a bag is written."""
+"""Names of new files, and the directory in which a bag is written."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ import fcntl
 import os
 from contextlib import suppress
 
-import pytest
-
 from diffdrive_jacobian.bags.files import REPLACED, scratch_directory
 from diffdrive_jacobian.plots import output_files
-from diffdrive_jacobian.plots.output_files import free_stem, new_file
+from diffdrive_jacobian.plots.output_files import free_stem
 
 
 class Still(output_files.datetime):
@@ -31,18 +29,6 @@ def test_a_free_stem_is_numbered_and_has_no_file_of_any_extension(tmp_path, monk
     (tmp_path / f'{stem}__2.csv').touch()
     assert free_stem('a', ('png', 'csv')) == f'{stem}__3'
     assert free_stem('a', ('png',)) == stem
-
-
-def test_a_new_file_is_checked(tmp_path):
-    assert new_file(str(tmp_path / 'a.PNG'), ('png',), 'picture') == tmp_path / 'a.PNG'
-    with pytest.raises(ValueError, match=r"the table must end in \.csv, got 'a.png'"):
-        new_file('a.png', ('csv',), 'table')
-    with pytest.raises(FileNotFoundError) as missing:
-        new_file(str(tmp_path / 'no' / 'a.csv'), ('csv',), 'table')
-    assert missing.value.filename == str(tmp_path / 'no' / 'a.csv')
-    (tmp_path / 'a.csv').touch()
-    with pytest.raises(FileExistsError, match='exists already; it is not overwritten'):
-        new_file(str(tmp_path / 'a.csv'), ('csv',), 'table')
 
 
 def test_remains_of_killed_processes_are_removed(tmp_path):

@@ -34,7 +34,7 @@ PAGE = TEST.parent / 'doc' / 'promises.md'
 NICE = 10
 """Priority of the processes: others come first."""
 BAG_TESTS = (
-    *('bags/test_damage_fuzz.py', 'bags/test_invalid_values.py', 'bags/test_hostile_bags.py'),
+    *('bags/test_damage_fuzz.py', 'bags/test_hostile_bags.py'),
     *('bags/test_damaged_bags.py', 'bags/test_recover.py'),
 )
 MOST_LISTED = 10
