@@ -15,7 +15,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
-from ruamel.yaml import YAML
 from support.bags import SECOND, odom, start, write_bag
 from support.raw_bags import PLUGINS, channel, data_file, run_tool, write_records
 from support.ros_messages import goal, joint_command, twist_stamped
@@ -28,6 +27,7 @@ from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.recovery import UncheckedError
 from diffdrive_jacobian.bags.timeline import commanded, limits, measured, timeline
 from diffdrive_jacobian.bags.verification import verify
+from diffdrive_jacobian.bounded_yaml import load_yaml
 from diffdrive_jacobian.plots.run_figure import LABELS
 from diffdrive_jacobian.tools import plot_run, recover_run, replay_run
 
@@ -67,7 +67,7 @@ def edit(bag, *keys_and_value):
     """Set the value at the end of a path of keys in metadata.yaml, or remove it if it is ABSENT."""
     *keys, last, value = keys_and_value
     path = bag / 'metadata.yaml'
-    content = YAML(typ='safe').load(path.read_text())
+    content = load_yaml(path)
     inner = content['rosbag2_bagfile_information']
     for key in keys:
         inner = inner[key]
@@ -145,7 +145,7 @@ def test_all_tools_agree_on_a_damaged_bag(bag, tmp_path, capsys, key, value):
 
 def topic_index(bag, topic='/odom'):
     """Return the index of a topic in metadata.yaml."""
-    content = YAML(typ='safe').load((bag / 'metadata.yaml').read_text())
+    content = load_yaml(bag / 'metadata.yaml')
     topics = content['rosbag2_bagfile_information'][TOPICS]
     return [one['topic_metadata']['name'] for one in topics].index(topic)
 
