@@ -32,9 +32,9 @@ for number in (signal.SIGHUP, signal.SIGINT):
 LONGEST_FIRST = (
     *('test_pages', 'test_explored_nodes', 'test_forked', 'test_damage_fuzz', 'test_processes'),
     *('test_replay_run', 'test_recover_crash', 'test_calibrate_run', 'test_exploration'),
-    *('test_external', 'test_own_controllers', 'test_fixtures', 'test_se2', 'test_process_faults'),
-    *('test_record_run', 'test_recording', 'test_live_browser'),
-    *('test_flood', 'test_calibration', 'test_faults_same', 'test_tools'),
+    *('test_external', 'test_external_failures', 'test_own_controllers', 'test_fixtures'),
+    *('test_process_faults', 'test_record_run', 'test_live_browser', 'test_flood', 'test_calibration'),
+    *('test_faults_same', 'test_faulty_drives'),
 )
 """Files with tests that take seconds. They start first, so that none is left for the end."""
 MEMORY = 700 << 20

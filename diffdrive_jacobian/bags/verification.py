@@ -507,8 +507,15 @@ def recorded_dynamics(run: Run) -> list[RobotModel]:
             changes[int((free or together)[0 if free else -1])].append((values,))
     for recorded, fault, what in run.fault_events:
         robot = _FAULTY_ROBOT.search(fault)
-        if robot is None or robot[1].split('/')[-1] == ROBOT:
-            changes[bisect_left(received, recorded)].append((fault, what))
+        if robot is not None and robot[1].split('/')[-1] != ROBOT:
+            continue
+        if not any(pattern.match(fault) for pattern, _ in _MOTOR_FAULTS):
+            continue
+        # As above. Where one fault ends and another begins, the robot is without both in between.
+        index = bisect_left(received, recorded)
+        while index in changes and received[index + 1 : index + 2] == [recorded]:
+            index += 1
+        changes[index].append((fault, what))
     values = dict(run.of_node(ROBOT))
     faults: list[str] = []
     model = _dynamics(values, faults)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import struct
+from contextlib import closing
 from pathlib import Path
 
 import lz4.frame
@@ -28,6 +29,21 @@ METADATA = """rosbag2_bagfile_information:
   files: []
 {more}"""
 
+
+def write_folder(
+    path: Path, file: str, content: bytes = b'', *, mode='', storage='mcap', more=''
+) -> Path:
+    """Write a bag's directory around one file; `content` is left alone if it is empty."""
+    path.mkdir(exist_ok=True)
+    if content:
+        (path / file).write_bytes(content)
+    compression = 'zstd' if mode else ''
+    (path / 'metadata.yaml').write_text(
+        METADATA.format(storage=storage, file=file, mode=mode, compression=compression, more=more)
+    )
+    return path
+
+
 # --- Compressed zeros
 
 
@@ -36,13 +52,10 @@ def zstd_zeros(size: int, *, declared: bool = True) -> bytes:
     # Frame header: content size in 8 bytes, window of 128 KiB; blocks that repeat one byte.
     frame = struct.pack('<IB', 0xFD2FB528, 0xC0 if declared else 0) + bytes([7 << 3])
     frame += struct.pack('<Q', size) if declared else b''
-    block = 1 << 17
-    count, rest = divmod(size, block)
-    sizes = [(block, count), (rest, 1)]
-    blocks = b''.join(
-        (struct.pack('<I', length << 3 | 1 << 1)[:3] + b'\0') * number for length, number in sizes
-    )
-    return frame + blocks + struct.pack('<I', 1)[:3]
+    count, rest = divmod(size, 1 << 17)
+    for length, number in ((1 << 17, count), (rest, 1)):
+        frame += (struct.pack('<I', length << 3 | 1 << 1)[:3] + b'\0') * number
+    return frame + struct.pack('<I', 1)[:3]
 
 
 def lz4_zeros(size: int) -> bytes:
@@ -130,25 +143,6 @@ def chunk_bomb(
     return mcap(first + one * times, tuple(entry) if indexed else (), end=end)
 
 
-def write_folder(
-    path: Path, file: str, content: bytes = b'', *, mode='', storage='mcap', more=''
-) -> Path:
-    """Write a bag's directory around one file; `content` is left alone if it is empty."""
-    path.mkdir(exist_ok=True)
-    if content:
-        (path / file).write_bytes(content)
-    (path / 'metadata.yaml').write_text(
-        METADATA.format(
-            storage=storage,
-            file=file,
-            mode=mode,
-            compression='zstd' if mode else '',
-            more=more,
-        )
-    )
-    return path
-
-
 # --- SQLite
 
 SCHEMA = """
@@ -163,78 +157,45 @@ MESSAGES = """CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT
 
 
 def write_sqlite(path: Path, *statements: str) -> Path:
-    with sqlite3.connect(path) as database:
+    with closing(sqlite3.connect(path)) as database, database:
         database.executescript(SCHEMA + ';'.join(statements))
-    database.close()
     return path
 
 
-def write_loop(path: Path, length: int) -> Path:
-    """Write a database whose message claims `length` bytes, in an overflow page that follows itself."""
-    write_sqlite(
-        path, TOPIC, MESSAGES, "INSERT INTO messages VALUES (1, 1, 1, X'00010000' || zeroblob(20000))"
-    )
-    with sqlite3.connect(path) as database:
-        (root,) = database.execute(
-            "SELECT rootpage FROM sqlite_master WHERE name = 'messages'"
-        ).fetchone()
-    database.close()
-    data = bytearray(path.read_bytes())
-    page = (root - 1) * 4096
+def varint(value: int) -> bytes:
+    """Return a number as SQLite writes those of four bytes."""
+    parts = [value >> 7 * place & 0x7F for place in (3, 2, 1, 0)]
+    return bytes([*(part | 0x80 for part in parts[:-1]), parts[-1]])
 
-    def varint(value: int, width: int) -> bytes:
-        parts = [value >> 7 * place & 0x7F for place in reversed(range(width))]
-        return bytes([part | 0x80 for part in parts[:-1]] + parts[-1:])
 
-    # The record's header: its length, NULL for the id, topic, time, and a blob of that length.
-    header = bytes([9, 0, 1, 1]) + varint(2 * length + 12, 5)
-    payload = header + b'\1\1' + b'\0\1\0\0'
-    total = len(header) + 2 + length
-    least = (4096 - 12) * 32 // 255 - 23
-    local = least + (total - least) % (4096 - 4)
-    local = local if local <= 4096 - 35 else least
-    overflow = root + 1
-    new = varint(total, 5) + b'\1' + payload.ljust(local, b'\0') + struct.pack('>I', overflow)
-    start = page + 4096 - len(new)
-    data[start : page + 4096] = new
-    struct.pack_into('>H', data, page + 8, start - page)
-    struct.pack_into('>H', data, page + 5, start - page)
-    struct.pack_into('>I', data, (overflow - 1) * 4096, overflow)
-    path.write_bytes(data)
+def write_loop(path: Path, pages: int) -> Path:
+    """Write a database whose message claims more pages than it has; the last page follows itself."""
+    size = 1 << 21
+    write_sqlite(path, TOPIC, MESSAGES, f'INSERT INTO messages VALUES (1, 1, 1, zeroblob({size}))')
+    data = path.read_bytes()
+    # The length of the row, with a header of 8 bytes. A page of the chain holds the number of the next
+    # one and 4092 bytes.
+    length = varint(size + 8)
+    assert data.count(length) == 1
+    data = data.replace(length, varint(size + 8 + 4092 * pages))
+    last = len(data) // 4096
+    path.write_bytes(data[:-4096] + struct.pack('>I', last) + data[-4092:])
     return path
 
 
-HOSTILE_SCHEMAS = {
-    'generated column': (
-        TOPIC,
-        """CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,
-            timestamp INTEGER NOT NULL, data BLOB AS (zeroblob(900000000)))""",
-        'INSERT INTO messages(id, topic_id, timestamp) VALUES (1, 1, 1)',
-    ),
-    'view of a blob': (
-        TOPIC,
-        MESSAGES.replace('messages', 'other'),
-        'CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, '
-        'zeroblob(900000000) AS data',
-        # rosbags wants a table of that name.
-        'PRAGMA writable_schema = ON',
-        "UPDATE sqlite_master SET type = 'table' WHERE name = 'messages'",
-    ),
-    'generated topics': (
-        """DROP TABLE topics; CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL,
-            type TEXT AS (hex(zeroblob(400000000))), serialization_format TEXT NOT NULL,
-            offered_qos_profiles TEXT NOT NULL)""",
-        MESSAGES,
-        "INSERT INTO messages VALUES (1, 1, 1, X'0001000000000000')",
-    ),
-    'endless view': (
-        'DROP TABLE topics',
-        """CREATE VIEW topics AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
-            SELECT id, '/odom' AS name, 'nav_msgs/msg/Odometry' AS type, 'cdr' AS serialization_format,
-            '' AS offered_qos_profiles FROM n""",
-        MESSAGES,
-    ),
-}
+GENERATED = (
+    TOPIC,
+    """CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,
+        timestamp INTEGER NOT NULL, data BLOB AS (zeroblob(900000000)))""",
+    'INSERT INTO messages(id, topic_id, timestamp) VALUES (1, 1, 1)',
+)
+ENDLESS = (
+    'DROP TABLE topics',
+    """CREATE VIEW topics AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
+        SELECT id, '/odom' AS name, 'nav_msgs/msg/Odometry' AS type, 'cdr' AS serialization_format,
+        '' AS offered_qos_profiles FROM n""",
+    MESSAGES,
+)
 
 # --- YAML
 

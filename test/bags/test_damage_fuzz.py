@@ -1,38 +1,115 @@
-"""Random damage of the bytes of bags and journals, and what is recovered and said of them.
+"""Random damage of bags and journals, of their bytes and of their values, and what is said of it.
 
-The oracle: in bounded memory, whatever the damage, the old files stay as they are, what was written
-before the damage is recovered, in its order, and nothing is called complete that lacks a message.
+The oracle, whatever the damage: in bounded memory, reading and recovery end with a typed error or with
+a run that can be used. The old files stay as they are. What was written before the damage is recovered,
+in its order. Nothing is called complete that lacks a message. What recovery writes is complete.
 """
 
 from __future__ import annotations
 
 import random
 import shutil
-from contextlib import suppress
+import sqlite3
+import struct
+import zlib
+from contextlib import closing, suppress
+from io import BytesIO
 
 import pytest
+from rclpy.serialization import serialize_message
 from rosbags.rosbag2 import CompressionMode
+from ruamel.yaml import YAML
+from support.bags import SECOND, changed, odom
+from support.bags import write_bag as write_sent
 from support.raw_bags import (
+    LATCHED,
+    PLUGINS,
+    channel,
     contents,
     data_file,
     make_messages,
+    mcap_records,
     names_of,
     read_bag,
-    recover,
     write_bag,
     write_journal,
+    write_records,
 )
+from support.ros_messages import goal, joint_command, twist
 
-from diffdrive_jacobian.bags import BagError, read_run
-from diffdrive_jacobian.bags import recover as write_recovered
+from diffdrive_jacobian.bags import BagError, NotABagError, NothingToSaveError, mcap, read_run, recover
+from diffdrive_jacobian.bags.bag_writer import build_bag
+from diffdrive_jacobian.bags.journal import Message, Text
+from diffdrive_jacobian.bags.recovery import Recovery, UncheckedError
+from diffdrive_jacobian.bags.run import Run
+from diffdrive_jacobian.bags.salvage import read_sqlite
+from diffdrive_jacobian.bags.timeline import commanded, limits, measured, timeline
+from diffdrive_jacobian.bags.verification import verify
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.plots.run_figure import LABELS
 
 pytestmark = pytest.mark.usefixtures('quick_disk', 'bounded_memory')
 
+TYPED = (BagError, NotABagError, NothingToSaveError, ParameterError)
+
+# --- The oracle
+
+
+def attempt(function, *arguments):
+    """Return what a call returns, or its typed error. Other errors are failures."""
+    try:
+        return function(*arguments)
+    except TYPED as error:
+        return error
+
+
+def trace(run):
+    """Trace a run as the tools do."""
+    one = timeline(run)
+    limits(one)
+    for quantity in LABELS:
+        measured(one, quantity)
+        commanded(one, quantity)
+
+
+def check(given, new):
+    """Read, use and recover what is damaged; return the run and the recovery, or errors instead."""
+    run = attempt(read_run, given)
+    if isinstance(run, Run):
+        attempt(verify, run)
+        attempt(trace, run)
+    folder = given if given.is_dir() else given.parent
+    before = contents(folder)
+    recovery = attempt(recover, given, new)
+    assert contents(folder) == before
+    if isinstance(recovery, Recovery):
+        assert len(read_bag(new)) == recovery.summary.messages
+    return run, recovery
+
+
+def check_values(given, new):
+    """Check also the new bag: it can be read, and is complete unless a definition cannot be parsed."""
+    run, recovery = check(given, new)
+    if isinstance(recovery, Recovery):
+        read_run(new)
+        with suppress(NothingToSaveError):
+            assert recover(new, new.with_name(f'{new.name} again')).topics_left_out
+    return run, recovery
+
+
+def is_subset(some, messages):
+    """Return whether some of the messages are only such, and in their order."""
+    rest = iter(messages)
+    return all(one in rest for one in some)
+
+
+# --- Bytes
+
 PAGE = 4096
 """Size of a page of SQLite (bytes)."""
-CASES = 2
+CASES = 1
 """For each kind of file and of damage."""
-SMALL, LARGE = make_messages(60, 400), make_messages(12, 20_000)
+SMALL, LARGE = make_messages(40, 400), make_messages(8, 20_000)
 """The large ones are in several pages of SQLite each."""
 KINDS = {
     'mcap': ('mcap', CompressionMode.NONE, SMALL),
@@ -46,20 +123,18 @@ KINDS = {
 }
 
 
-@pytest.fixture(scope='module', params=KINDS)
-def whole(request, tmp_path_factory):
-    """Path of a bag or journal, its messages, and whether their bytes are in the file as they are."""
+@pytest.fixture(params=KINDS)
+def whole(request, tmp_path):
+    """Kind and path of a bag or journal, its messages, and whether their bytes are in the file."""
     storage, mode, messages = KINDS[request.param]
-    path = tmp_path_factory.mktemp('whole') / 'run'
+    path = tmp_path / 'whole' / 'run'
+    path.parent.mkdir()
     if storage in ('mcap', 'sqlite3'):
         write_bag(path, storage, messages, mode)
     else:
         journal = write_journal(path, messages)
-        path = journal if storage == 'journal' else write_recovered(journal).bag
-    return path, messages, mode in (None, CompressionMode.NONE)
-
-
-# --- Damage at a place
+        path = journal if storage == 'journal' else recover(journal).bag
+    return request.param, path, messages, mode in (None, CompressionMode.NONE)
 
 
 def cut(data, at, chance):
@@ -100,15 +175,13 @@ def reorder(data, at, chance):
 
 DAMAGE = (cut, erase, flip_bits, overwrite, write_length, duplicate, reorder)
 
-# --- What must be left
-
 
 def left_by(data, damaged, messages, how):
     """Return messages that the damage of a file leaves."""
     changed = {
         at // PAGE for at in range(0, len(data), PAGE) if data[at : at + PAGE] != damaged[at : at + PAGE]
     }
-    if data.startswith(b'\x89MCAP'):
+    if data.startswith(mcap.MAGIC):
         start = min(changed, default=0) * PAGE
         blocks = zip(data[start:], damaged[start:], strict=False)
         first = start + next(
@@ -128,21 +201,10 @@ def pages(data, content):
     return {data.index(part) // PAGE for part in parts if part in data}
 
 
-def is_subset(some, messages):
-    """Return whether some of the messages are only such, and in their order."""
-    rest = iter(messages)
-    return all(one in rest for one in some)
-
-
-@pytest.mark.parametrize(
-    'how',
-    [cut, erase, flip_bits, overwrite, write_length, duplicate, reorder],
-    ids=lambda one: one.__name__,
-)
-def test_damaged_bytes(whole, tmp_path, capsys, how):
-    path, messages, plain = whole
-    chance = random.Random(f'{path.suffix} {how.__name__}')
-    for number in range(CASES):
+def test_damaged_bytes(whole, tmp_path):
+    kind, path, messages, plain = whole
+    for number, how in enumerate(DAMAGE * CASES):
+        chance = random.Random(f'{kind} {number}')
         folder = tmp_path / str(number)
         folder.mkdir()
         old = (shutil.copytree if path.is_dir() else shutil.copyfile)(path, folder / path.name)
@@ -151,46 +213,186 @@ def test_damaged_bytes(whole, tmp_path, capsys, how):
         damaged = bytearray(data)
         how(damaged, chance.choice((0, 8, len(data) - 1, *chance.sample(range(len(data)), 5))), chance)
         file.write_bytes(damaged)
-        if old.is_dir() and number % 2:
+        if old.is_dir() and chance.random() < 0.5:
             (old / 'metadata.yaml').unlink()
         given = file if chance.random() < 0.3 else old
-        with pytest.raises(BagError) if how is cut else suppress(BagError):
-            read_run(given)
-        before = contents(file.parent)
-        code, out, err = recover(capsys, given, '-o', folder / 'new')
-        assert contents(file.parent) == before
-        assert code in (0, 1, 3) or (code == 2 and 'is neither MCAP nor SQLite' in err)
-        found = read_bag(folder / 'new') if code == 0 else []
-        if code == 0:
-            assert f'{len(found)} messages' in out
-            assert err == ''
-        if plain:
-            assert (
-                code == 3
-                or 'is complete' in err
-                or is_subset(left_by(data, damaged, messages, how), found)
-            )
+        run, recovery = check(given, folder / 'new')
+        saved = isinstance(recovery, Recovery)
+        found = read_bag(folder / 'new') if saved else []
+        complete = 'is complete' in str(recovery)
         if how is cut:
+            assert isinstance(run, BagError)
             assert is_subset(found, messages)
-        if 'is complete' in err:
+        if plain and not complete and not isinstance(recovery, UncheckedError):
+            assert is_subset(left_by(data, damaged, messages, how), found)
+        if complete:
             assert read_bag(given) == messages
-        elif code == 0 and 'lost: ' not in out and 'loss cannot be excluded: ' not in out:
+        elif saved and not recovery.lost and not recovery.unchecked:
             assert found == messages
 
 
-def test_undamaged_files_without_metadata(whole, tmp_path, capsys):
-    path, messages, _ = whole
+def test_a_changed_byte_of_a_database_alters_one_message_at_most(tmp_path):
+    messages = [('/odom', 1 + number, b'\0\1\0\0' + bytes([number]) * 3000) for number in range(12)]
+    write_bag(tmp_path / 'bag', 'sqlite3', messages)
+    data = data_file(tmp_path / 'bag').read_bytes()
+    chance, contents_of = random.Random('database'), {one[2] for one in messages}
+    page = data.rindex(messages[0][2][:9]) // PAGE * PAGE
+    for _ in range(300):
+        changed = bytearray(data)
+        # The pages of messages begin with the places of their rows, and end with these.
+        at = chance.choice((page + chance.randrange(100), chance.randrange(len(data))))
+        changed[at] ^= 1 << chance.randrange(8)
+        found = [one for one in read_sqlite(BytesIO(changed), list, list) if isinstance(one, Message)]
+        assert len(found) <= len(messages)
+        assert sum(one.data not in contents_of for one in found) <= 1
+
+
+def test_undamaged_files_without_metadata(whole, tmp_path):
+    _, path, messages, _ = whole
     given = tmp_path / path.name
     if path.is_dir():
         given.mkdir()
-        shutil.copy(data_file(path), given)
-    else:
-        shutil.copy(path, given)
-    code, out, err = recover(capsys, given, '-o', tmp_path / 'new')
-    assert (code, err) == (0, '')
+    shutil.copy(data_file(path) if path.is_dir() else path, given)
+    recovery = recover(given, tmp_path / 'new')
     assert read_bag(tmp_path / 'new') == messages
-    assert 'lost: ' not in out
-    assert 'loss cannot be excluded: ' in out
+    assert recovery.lost == ()
+    assert recovery.unchecked
     if path.is_dir():
-        assert 'there is no valid metadata.yaml' in out
+        assert any('there is no valid metadata.yaml' in one for one in recovery.unchecked)
         assert names_of(tmp_path / 'new') == names_of(path)
+
+
+# --- Values
+
+VALUES = (
+    *(None, True, 0, -1, 1, 7, 2**31, 2**63 - 1, 2**63, -(2**63), 10**30, 0.5, -0.0, 1e308),
+    *(float('nan'), float('inf'), '', 'x', '/odom', '3', '\0', '\x1b[2J', 'a/b/c/d', '../..', 'é' * 300),
+    *('nav_msgs/msg/Odometry', 'this/msg/X', 'a.b/msg/C', '{', '[', '- &a [*a]', '{"a": NaN}'),
+    *([], {}, [None], [[]], ['x'], {'x': None}, {'nanoseconds': 'x'}, [{'topic_metadata': {}}]),
+)
+PARAMETERS = {'/virtual_robot': {'wheel_radius': 0.03}, '/go_to_goal': {'xy_goal_tolerance': 0.1}}
+
+
+def sent():
+    """Yield what is in the bags whose values are damaged."""
+    for index in range(4):
+        at = 1.0 + index / 10
+        yield at, '/odom', odom(index / 20, 0, 0, 0.5, seconds=at)
+        yield at, '/cmd_vel', twist(0.5, 0.0)
+        yield at, '/joint_states', joint_command(1.0, 1.0, round(at * SECOND))
+    yield 1.2, '/goal_pose', goal(0.3, 0.1)
+    yield 1.3, '/parameter_events', changed('/virtual_robot', 'wheel_radius', 0.04)
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('bags')
+    messages = sorted(sent(), key=lambda one: one[0])
+    return {
+        storage: write_sent(folder / storage, messages, storage=storage, parameters=PARAMETERS)
+        for storage in PLUGINS
+    }
+
+
+def mutate(content, chance):
+    """Replace or remove a value of nested maps and lists."""
+    while True:
+        key = chance.choice([*(content if isinstance(content, dict) else range(len(content)))])
+        inner = content[key]
+        if not isinstance(inner, (dict, list)) or not inner or chance.random() < 0.2:
+            break
+        content = inner
+    if chance.random() < 0.15:
+        del content[key]
+    else:
+        content[key] = chance.choice(VALUES)
+
+
+def test_values_of_metadata(bags, tmp_path):
+    chance, yaml, results = random.Random('metadata'), YAML(typ='safe'), set()
+    for number in range(5):
+        bag = shutil.copytree(bags[list(PLUGINS)[number % 2]], tmp_path / f'{number}' / 'bag')
+        content = yaml.load((bag / 'metadata.yaml').read_text())
+        mutate(content, chance)
+        with open(bag / 'metadata.yaml', 'w') as file:
+            yaml.dump(content, file)
+        results.add(type(check_values(bag, bag.with_name('new'))[0]) is Run)
+    assert results == {True, False}
+
+
+TABLES = ('topics', 'topics', 'messages', 'messages', 'message_definitions', 'schema', 'metadata')
+
+
+def test_cells_of_sqlite(bags, tmp_path):
+    chance, results = random.Random('cells'), set()
+    cells = [one for one in VALUES if not isinstance(one, (list, dict)) and one not in (2**63, 10**30)]
+    cells += [b'', b'\0', b'\0\1\0\0', b'\xff' * 40, chance.randbytes(400)]
+    for number in range(5):
+        bag = shutil.copytree(bags['sqlite3'], tmp_path / f'{number}' / 'bag')
+        with closing(sqlite3.connect(data_file(bag))) as database, database:
+            for _ in range(chance.choice((2, 3, 5))):
+                table = chance.choice(TABLES)
+                column = chance.choice(database.execute(f'PRAGMA table_info({table})').fetchall())[1]
+                (row,) = chance.choice(database.execute(f'SELECT rowid FROM {table}').fetchall())
+                change = f'UPDATE {table} SET {column} = ? WHERE rowid = ?'
+                # Some are refused for the type of the column.
+                with suppress(sqlite3.IntegrityError):
+                    database.execute(change, (chance.choice(cells), row))
+        if number % 4 == 0:
+            check_values(data_file(bag), bag.with_name('of the file'))
+        results.add(type(check_values(bag, bag.with_name('new'))[0]) is Run)
+    assert results == {True, False}
+
+
+def test_bytes_of_messages(tmp_path):
+    """Damaged messages are either used or counted."""
+    chance = random.Random('messages')
+    channels, records = {}, []
+    for _ in range(3):
+        for at, topic, message in sent():
+            data = bytearray(serialize_message(message))
+            for _ in range(chance.choice((0, 1, 3))):
+                data[chance.randrange(4, len(data))] = chance.choice((0, 1, 0x7F, 0x80, 0xFF))
+            name = f'{type(message).__module__.split(".")[0]}/msg/{type(message).__name__}'
+            known = channels.setdefault(topic, channel(len(channels), topic, name, (LATCHED,)))
+            cut_at = chance.choice((len(data), 12))
+            records.append(Message(known.id, round(at * SECOND), bytes(data[:cut_at])))
+    build_bag(channels.values(), records, tmp_path / 'bag', 'mcap')
+    run, _ = check_values(tmp_path / 'bag', tmp_path / 'new')
+    assert sum(run.skipped.values()) > 0
+
+
+def test_records_of_journals_with_right_checksums(tmp_path):
+    written = [
+        Text('storage', 'mcap'),
+        Text('parameters of /go_to_goal', '{"kp": 3.0}'),
+        channel(0, '/odom', 'nav_msgs/msg/Odometry', (LATCHED,)),
+        channel(1, '/cmd_vel', 'geometry_msgs/msg/Twist', (LATCHED,)),
+    ]
+    for second in (1, 2, 3):
+        pose = serialize_message(odom(second, 0, 0, seconds=second))
+        written.append(Message(0, second * SECOND, pose))
+        written.append(Message(1, second * SECOND, serialize_message(twist(0.5, 0.0))))
+    whole = write_records(tmp_path / 'good', *written).read_bytes()
+    *outside, (_, chunk, end) = mcap_records(whole)
+    # After opcode, length, times, size, checksum, compression and size of a chunk.
+    inside = chunk + 49
+    chance, results = random.Random('journal'), set()
+    for number in range(10):
+        data = bytearray(whole)
+        for _ in range(chance.choice((1, 1, 2, 3))):
+            _, at, to = chance.choice([*outside, *mcap_records(whole, inside) * 2])
+            place = chance.choice((at, chance.randrange(at + 9, to)))
+            value = chance.choice((b'\0', b'\xff', b'\xed\xa0\x80', chance.randbytes(2)))
+            data[place : place + len(value)] = value
+        for opcode, at, to in outside:
+            if opcode == mcap.ATTACHMENT:
+                data[to - 4 : to] = struct.pack('<I', zlib.crc32(data[at + 9 : to - 4]))
+        data[chunk + 33 : chunk + 37] = struct.pack('<I', zlib.crc32(data[inside:end]))
+        path = tmp_path / f'{number}' / 'run.journal.mcap'
+        path.parent.mkdir()
+        path.write_bytes(data)
+        run, recovery = check_values(path, path.with_name('new'))
+        assert isinstance(run, BagError)
+        results.add(isinstance(recovery, Recovery))
+    assert results == {True, False}

@@ -1,4 +1,4 @@
-"""Faults of a recorded lockstep world: read from the bag, and marked in the figure."""
+"""Faults of a recorded lockstep world, marked in the figure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import Twist, Vector3
 from std_msgs.msg import String
-from support.bags import SECOND, write_bag
+from support.bags import write_bag
 from support.runs import sample
 
 from diffdrive_jacobian.bags.run import read_run
@@ -22,27 +22,21 @@ def event(at, fault, what):
     return at, '/fault_events', String(data=json.dumps({'time': at, 'fault': fault, 'what': what}))
 
 
-def run_of(tmp_path, *extra):
-    """Read a run of four seconds that begins at 10 s."""
-    return read_run(write_bag(tmp_path / 'run', sample(extra)))
-
-
 def labels(drawing):
     return [text.get_text() for legend in drawing.legends for text in legend.get_texts()]
 
 
-def test_faults_are_bands_over_time(tmp_path):
+def test_faults_are_bands_over_time_and_many_are_counted(tmp_path):
     loss, kill = "Loss('odom', start=1.0, duration=0.5)", "Kill('robot', start=2.0)"
-    run = run_of(
-        tmp_path,
+    events = [
         event(11.0, loss, 'begins'),
         event(11.2, loss, 'messages 1 to 9 of /odom to /controller lost'),
         event(11.5, loss, 'ends: 25 of 25 messages of /odom to /controller'),
         event(12.0, kill, 'begins'),
         event(12.0, kill, '/robot is killed'),
-    )
-    assert run.fault_events[0] == (11 * SECOND, loss, 'begins')
-    assert '5 events of faults' in repr(run)
+    ]
+    # It begins at 10 s and takes four seconds.
+    run = read_run(write_bag(tmp_path / 'run', sample(events)))
     spans = fault_spans(timeline(run))
     assert [span.fault for span in spans] == [loss, kill]
     assert spans[0][1:] == pytest.approx((1.0, 1.5))
@@ -56,21 +50,10 @@ def test_faults_are_bands_over_time(tmp_path):
         assert [patch.get_x() for patch in panel.patches] == pytest.approx([1.0, 2.0])
     # Several runs are compared without them.
     assert labels(figure([run, run])) == []
-
-
-def test_many_faults_are_counted(tmp_path):
-    events = [event(10.1 + 0.1 * number, f'Stale({number})', 'begins') for number in range(NAMED + 3)]
-    drawing = figure([run_of(tmp_path, *events)])
-    assert len(labels(drawing)) == NAMED
-    assert labels(drawing)[-1] == 'and 4 more faults'
-
-
-def test_other_messages_on_the_topic_are_noted(tmp_path):
-    texts = ('', 'x', '3', '{"fault": 1, "what": "begins"}', '[' * 100_000)
-    run = run_of(tmp_path, *((11.0, '/fault_events', String(data=data)) for data in texts))
-    assert run.fault_events == ()
-    assert '5 of 5 messages on /fault_events hold invalid' in run.notes[0]
-    assert fault_spans(timeline(run)) == []
+    events += [event(12.1 + 0.1 * number, f'Stale({number})', 'begins') for number in range(NAMED + 1)]
+    many = labels(figure([read_run(write_bag(tmp_path / 'many', sample(events)))]))
+    assert len(many) == NAMED
+    assert many[-1] == 'and 4 more faults'
 
 
 def test_lines_are_broken_where_time_goes_back_and_a_push_is_a_line(lockstep, robot_at, tmp_path):

@@ -1,17 +1,14 @@
-"""Names of new files, checks before they are written, and the directory in which a bag is written."""
+"""Names of new files, and the directory in which a bag is written."""
 
 from __future__ import annotations
 
 import fcntl
 import os
 from contextlib import suppress
-from itertools import islice
-
-import pytest
 
 from diffdrive_jacobian.bags.files import REPLACED, scratch_directory
 from diffdrive_jacobian.plots import output_files
-from diffdrive_jacobian.plots.output_files import free_stem, names_by_time, new_file
+from diffdrive_jacobian.plots.output_files import free_stem
 
 
 class Still(output_files.datetime):
@@ -22,36 +19,19 @@ class Still(output_files.datetime):
         return cls(2026, 1, 2, 3, 4, 5)
 
 
-def test_names_by_time_are_numbered(monkeypatch):
-    monkeypatch.setattr(output_files, 'datetime', Still)
-    stem = 'run_2026_01_02-03_04_05'
-    assert list(islice(names_by_time('run'), 3)) == [stem, f'{stem}__2', f'{stem}__3']
-
-
-def test_a_free_stem_has_no_file_of_any_extension(tmp_path, monkeypatch):
+def test_a_free_stem_is_numbered_and_has_no_file_of_any_extension(tmp_path, monkeypatch):
     monkeypatch.setattr(output_files, 'datetime', Still)
     monkeypatch.chdir(tmp_path)
     stem = free_stem('a', ('png', 'csv'))
+    assert stem == 'a_2026_01_02-03_04_05'
     (tmp_path / f'{stem}.csv').symlink_to('nowhere')
     assert free_stem('a', ('png', 'csv')) == f'{stem}__2'
+    (tmp_path / f'{stem}__2.csv').touch()
+    assert free_stem('a', ('png', 'csv')) == f'{stem}__3'
     assert free_stem('a', ('png',)) == stem
 
 
-def test_a_new_file_is_checked(tmp_path):
-    assert new_file(str(tmp_path / 'a.PNG'), ('png',), 'picture') == tmp_path / 'a.PNG'
-    with pytest.raises(ValueError, match=r"the table must end in \.csv, got 'a.png'"):
-        new_file('a.png', ('csv',), 'table')
-    with pytest.raises(FileNotFoundError) as missing:
-        new_file(str(tmp_path / 'no' / 'a.csv'), ('csv',), 'table')
-    assert missing.value.filename == str(tmp_path / 'no' / 'a.csv')
-    (tmp_path / 'a.csv').touch()
-    with pytest.raises(FileExistsError, match='exists already; it is not overwritten'):
-        new_file(str(tmp_path / 'a.csv'), ('csv',), 'table')
-
-
-@pytest.fixture
-def remains(tmp_path):
-    """Create what processes that were killed have left, by the end of its name."""
+def test_remains_of_killed_processes_are_removed(tmp_path):
     made = {}
     for end in ('one', 'two', 'running', 'replacing', 'starting'):
         made[end] = tmp_path / f'.r[u]n.building-{end}'
@@ -60,16 +40,11 @@ def remains(tmp_path):
     (made['replacing'] / REPLACED).mkdir()
     (made['starting'] / 'r[u]n' / 'r[u]n.mcap').unlink()
     (made['starting'] / 'r[u]n').rmdir()
-    return made
-
-
-def test_remains_of_the_same_bag_are_removed(tmp_path, remains):
     other = tmp_path / '.other.building-x' / 'other'
     other.mkdir(parents=True)
-    (tmp_path / 'precious').mkdir()
-    (tmp_path / 'precious' / 'r[u]n').mkdir()
+    (tmp_path / 'precious' / 'r[u]n').mkdir(parents=True)
     (tmp_path / '.r[u]n.building-link').symlink_to('precious')
-    running = os.open(remains['running'], os.O_RDONLY)
+    running = os.open(made['running'], os.O_RDONLY)
     fcntl.flock(running, fcntl.LOCK_EX)
     with scratch_directory(tmp_path / 'r[u]n') as scratch:
         (scratch / 'r[u]n').mkdir()
@@ -78,14 +53,14 @@ def test_remains_of_the_same_bag_are_removed(tmp_path, remains):
         assert scratch.exists()
     os.close(running)
     # Being written, with the bag that was replaced, about to be locked, a link, of another bag.
-    kept = [remains[end] for end in ('running', 'replacing', 'starting')]
+    kept = [made[end] for end in ('running', 'replacing', 'starting')]
     assert sorted(tmp_path.iterdir()) == sorted(
         [*kept, tmp_path / '.r[u]n.building-link', tmp_path / 'precious', other.parent]
     )
     assert (tmp_path / 'precious' / 'r[u]n').exists()
 
 
-def test_it_is_removed_also_after_an_error(tmp_path):
+def test_the_directory_is_removed_also_after_an_error(tmp_path):
     with suppress(OSError), scratch_directory(tmp_path / 'run') as scratch:
         (scratch / 'run').mkdir()
         raise OSError('full')

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Twist
-from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -26,17 +25,15 @@ from support.ros_messages import (
 from support.runs import built_run, sample, series
 
 from diffdrive_jacobian.bags import BagError, read_run
-from diffdrive_jacobian.bags import timeline as timeline_module
 from diffdrive_jacobian.bags.bag_reader import ReadingInterruptedError
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.bags.message_definitions import known_structure
+from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import GOALS
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
-from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import calibrate_run
 
 FIELDS = (
     *('odometry', 'cmd_vel', 'cmd_vel_out', 'start_pose'),
@@ -63,13 +60,10 @@ def test_every_series_holds_what_was_sent(tmp_path, namespace, storage):
         (1.8, 'goal_status', status(4, seconds=7)),
         (1.9, 'odom', odom(-0.1, -0.2, 3.0, seconds=1.85)),
     ]
-    run = read_run(
-        write_bag(
-            tmp_path / 'bag',
-            [(at, f'{namespace}/{topic}', message) for at, topic, message in sent],
-            storage=storage,
-        )
-    )
+    named = [(at, f'{namespace}/{topic}', message) for at, topic, message in sent]
+    # Of other types or names.
+    named += [(1.0, '/r1/odom', twist(0, 0)), (2.0, '/r1/cmd_vel', String()), (3.0, '/text', String())]
+    run = read_run(write_bag(tmp_path / 'bag', named, storage=storage))
 
     def holds(series, received, stamps, values):
         assert (series.received / SECOND).tolist() == pytest.approx(received, abs=1e-12)
@@ -93,6 +87,7 @@ def test_every_series_holds_what_was_sent(tmp_path, namespace, storage):
     ]
     holds(run.planned_path, [1.75, 1.75, 1.76, 1.76], [8.0, 8.0, 9.0, 9.0], planned)
     holds(run.goal_status, [1.8], [7.0], [[4.0]])
+    assert run.notes == ()
 
 
 def test_commands_may_be_stamped(tmp_path):
@@ -109,8 +104,7 @@ def test_topics_that_are_missing_give_empty_series(tmp_path):
     run = read_run(write_bag(tmp_path / 'bag', []))
     for name in FIELDS:
         series = getattr(run, name)
-        assert len(series) == 0
-        assert series.values.shape == (0, series.values.shape[1])
+        assert series.values.shape == (0, len(series.columns))
         assert series.received.dtype == series.stamps.dtype == np.int64
     assert (run.parameters, run.parameter_events) == ({}, ())
 
@@ -133,17 +127,50 @@ def test_messages_that_the_nodes_drop_are_left_out_and_counted(tmp_path):
         assert note in run.notes
 
 
-@pytest.mark.parametrize('speed', [1e6, -1e6])
-def test_wheel_speeds_are_plausible_up_to_a_limit(tmp_path, speed):
-    beyond = float(np.nextafter(speed, 2.0 * speed))
-    sent = [
-        (1.0, '/joint_states', joint_command(speed, 0)),
-        (2.0, '/joint_states', joint_command(0, beyond)),
-    ]
-    assert read_run(write_bag(tmp_path / 'bag', sent)).wheels.values.tolist() == [[0.0, speed]]
+def test_wheel_speeds_and_waypoints_are_plausible_up_to_a_limit(tmp_path):
+    sent = [(3.0, '/goals', goals(*[goal(1.0, 0.0)] * MAX_WAYPOINTS))]
+    for speed in (1e6, -1e6):
+        sent.append((1.0, '/joint_states', joint_command(speed, 0)))
+        sent.append((2.0, '/joint_states', joint_command(0, math.nextafter(speed, 2.0 * speed))))
+    run = read_run(write_bag(tmp_path / 'bag', sent))
+    assert run.wheels.values.tolist() == [[0.0, 1e6], [0.0, -1e6]]
+    assert len(run.goals) == MAX_WAYPOINTS
 
 
-# --- What is printed
+@pytest.mark.parametrize('order', ['<', '>'])
+def test_the_number_of_poses_is_known_without_decoding_them(order):
+    """1.5 million poses would take seconds of each message."""
+    read = GOALS.reader(known_structure(GOALS.type_name))
+    for frame in (b'', b'a' * 300):
+        for number in (MAX_WAYPOINTS + 1, 2**32 - 1):
+            data = b'\0\1\0\0' if order == '<' else bytes(4)
+            data += struct.pack(f'{order}iII', 1, 2, len(frame) + 1) + frame + b'\0'
+            data += bytes(-len(data) % 4) + struct.pack(f'{order}I', number)
+            with pytest.raises(MessageError, match=f'at most {MAX_WAYPOINTS} poses, got {number}'):
+                read(data)
+            with pytest.raises(DecodingError):
+                read(data[:-1])
+
+
+def test_messages_that_cannot_be_decoded_are_skipped_and_counted(tmp_path):
+    good = Message(0, SECOND, serialize_message(odom(1, 2, 0)))
+    damaged = [Message(0, SECOND, data) for data in (b'', b'\x00\x01\x00\x00', b'\xff' * 300)]
+    records = [good, *damaged, good]
+    build_bag([channel(0, '/odom', 'nav_msgs/msg/Odometry')], records, tmp_path / 'bag', 'mcap')
+    run = read_run(tmp_path / 'bag')
+    assert run.odometry.values[:, 0].tolist() == [1.0, 1.0]
+    assert run.skipped == {'/odom': 3}
+    assert run.notes == ('3 of 5 messages on /odom cannot be decoded and were skipped',)
+
+
+def test_events_of_faults_are_read_and_other_messages_on_their_topic_noted(tmp_path):
+    texts = ['', 'x', '3', '{"fault": 1, "what": "begins"}', '[' * 100_000]
+    texts.append(json.dumps({'time': 1.0, 'fault': 'Loss()', 'what': 'begins'}))
+    sent = [(11.0, '/fault_events', String(data=data)) for data in texts]
+    run = read_run(write_bag(tmp_path / 'bag', sent))
+    assert run.fault_events == ((11 * SECOND, 'Loss()', 'begins'),)
+    assert '1 events of faults' in repr(run)
+    assert '5 of 6 messages on /fault_events hold invalid' in run.notes[0]
 
 
 def test_a_run_and_a_series_are_printed_in_short(tmp_path):
@@ -163,82 +190,6 @@ def test_a_run_and_a_series_are_printed_in_short(tmp_path):
     )
 
 
-# --- Names
-
-
-def test_several_topics_of_one_name_are_told_apart_by_whom_is_meant(tmp_path):
-    sent = [(1.0, f'/r{index}/odom', odom(index, 0, 0)) for index in (1, 2)]
-    bag = write_bag(tmp_path / 'bag', sent)
-    with pytest.raises(BagError, match='several topics odom: /r1/odom, /r2/odom'):
-        read_run(bag)
-    assert read_run(bag, {'odom': '/r2/odom'}).odometry.values[0, 0] == 2.0
-
-
-def test_a_topic_may_have_another_name(tmp_path):
-    bag = write_bag(tmp_path / 'bag', [(1.0, '/pose', odom(1, 0, 0)), (1.0, '/odom', String())])
-    assert len(read_run(bag).odometry) == 0
-    assert len(read_run(bag, {'odom': '/pose'}).odometry) == 1
-
-
-@pytest.mark.parametrize('topic', ['/nowhere', '/text'])
-def test_a_named_topic_must_be_there_and_of_its_type(tmp_path, topic):
-    bag = write_bag(tmp_path / 'bag', [(1.0, '/text', String())])
-    with pytest.raises(BagError, match=f'no topic {topic} of nav_msgs/msg/Odometry; it has /text'):
-        read_run(bag, {'odom': topic})
-
-
-def test_topics_of_other_names_or_types_are_not_read(tmp_path):
-    sent = [(1.0, '/odom', Twist()), (2.0, '/cmd_vel', Odometry()), (3.0, '/chatter', String())]
-    run = read_run(write_bag(tmp_path / 'bag', sent))
-    assert [len(getattr(run, name)) for name in FIELDS] == [0] * len(FIELDS)
-    assert run.notes == ()
-
-
-# --- Parameters
-
-
-def test_parameters_are_those_of_the_beginning_and_changes_come_after(tmp_path):
-    parameters = {
-        '/a/virtual_robot': {'max_wheel_velocity': math.nan},
-        '/go_to_goal': {'kp': 3.0},
-    }
-    sent = [(2.0, '/parameter_events', changed('/go_to_goal', 'kp', 6.0))]
-    run = read_run(write_bag(tmp_path / 'bag', sent, parameters=parameters))
-    assert math.isnan(run.of_node('virtual_robot')['max_wheel_velocity'])
-    assert run.of_node('go_to_goal') == {'kp': 3.0}
-    assert run.of_node('wheel_bridge') == {}
-    assert run.parameter_events == ((2 * SECOND, '/go_to_goal', {'kp': 6.0}),)
-
-
-def test_of_several_nodes_of_a_name_none_is_meant(tmp_path):
-    parameters = {f'/{name}/go_to_goal': {'kp': 3.0} for name in 'ab'}
-    run = read_run(write_bag(tmp_path / 'bag', [], parameters=parameters))
-    assert run.of_node('go_to_goal') == {}
-
-
-def test_parameters_name_the_wheels(tmp_path):
-    names = {'left_wheel_name': 'L', 'right_wheel_name': 'R'}
-    message = JointState(name=['R', 'L'], velocity=[2.0, 1.0])
-    bag = write_bag(
-        tmp_path / 'bag', [(1.0, '/joint_states', message)], parameters={'/virtual_robot': names}
-    )
-    assert read_run(bag).wheels.values.tolist() == [[2.0, 1.0]]
-
-
-def test_messages_that_cannot_be_decoded_are_skipped_and_counted(tmp_path):
-    good = Message(0, SECOND, serialize_message(odom(1, 2, 0)))
-    damaged = [Message(0, SECOND, data) for data in (b'', b'\x00\x01\x00\x00', b'\xff' * 300)]
-    records = [good, *damaged, good]
-    build_bag([channel(0, '/odom', 'nav_msgs/msg/Odometry')], records, tmp_path / 'bag', 'mcap')
-    run = read_run(tmp_path / 'bag')
-    assert run.odometry.values[:, 0].tolist() == [1.0, 1.0]
-    assert run.skipped == {'/odom': 3}
-    assert run.notes == ('3 of 5 messages on /odom cannot be decoded and were skipped',)
-
-
-# --- A recorded robot
-
-
 def test_a_bag_of_another_robot_is_read():
     run = read_run(REAL)
     assert len(run.odometry) > 1000
@@ -249,85 +200,64 @@ def test_a_bag_of_another_robot_is_read():
     }
 
 
-# --- Many waypoints
+# --- Names and parameters
 
 
-def test_as_many_poses_as_the_node_accepts_are_read(tmp_path):
-    most = goals(*[goal(1.0, 0.0)] * MAX_WAYPOINTS)
-    assert len(read_run(write_bag(tmp_path / 'bag', [(2.0, '/goals', most)])).goals) == MAX_WAYPOINTS
+def test_several_topics_of_one_name_are_told_apart_by_whom_is_meant(tmp_path):
+    sent = [(1.0, f'/r{index}/odom', odom(index, 0, 0)) for index in (1, 2)]
+    bag = write_bag(tmp_path / 'bag', [*sent, (1.0, '/pose', odom(3, 0, 0)), (1.0, '/text', String())])
+    with pytest.raises(BagError, match='several topics odom: /r1/odom, /r2/odom'):
+        read_run(bag)
+    for topic, x in (('/r2/odom', 2.0), ('/pose', 3.0)):
+        assert read_run(bag, {'odom': topic}).odometry.values[0, 0] == x
+    for topic in ('/nowhere', '/text'):
+        with pytest.raises(BagError, match=f'no topic {topic} of nav_msgs/msg/Odometry; it has /pose, '):
+            read_run(bag, {'odom': topic})
 
 
-@pytest.mark.parametrize('order', ['<', '>'])
-def test_the_number_of_poses_is_known_without_decoding_them(order):
-    """1.5 million poses would take seconds of each message."""
-    read = GOALS.reader(known_structure(GOALS.type_name))
-    for frame in (b'', b'odom', b'a' * 300):
-        for number in (MAX_WAYPOINTS + 1, 2**32 - 1):
-            data = b'\0\1\0\0' if order == '<' else bytes(4)
-            data += struct.pack(f'{order}iII', 1, 2, len(frame) + 1) + frame + b'\0'
-            data += bytes(-len(data) % 4) + struct.pack(f'{order}I', number)
-            with pytest.raises(MessageError, match=f'at most {MAX_WAYPOINTS} poses, got {number}'):
-                read(data)
-            for end in range(len(data)):
-                with pytest.raises(DecodingError):
-                    read(data[:end])
+def test_parameters_are_those_of_the_beginning_and_changes_come_after(tmp_path):
+    parameters = {
+        '/a/virtual_robot': {'max_wheel_velocity': math.nan},
+        '/go_to_goal': {'kp': 3.0},
+        **{f'/{name}/wheel_bridge': {'left_wheel_name': 'L', 'right_wheel_name': 'R'} for name in 'ab'},
+    }
+    sent = [
+        (1.0, '/joint_states', JointState(name=['R', 'L'], velocity=[2.0, 1.0])),
+        (2.0, '/parameter_events', changed('/go_to_goal', 'kp', 6.0)),
+    ]
+    run = read_run(write_bag(tmp_path / 'bag', sent, parameters=parameters))
+    assert math.isnan(run.of_node('virtual_robot')['max_wheel_velocity'])
+    assert run.of_node('go_to_goal') == {'kp': 3.0}
+    # Of several none is meant, but the names of the wheels are the same.
+    assert run.of_node('wheel_bridge') == {}
+    assert run.wheels.values.tolist() == [[2.0, 1.0]]
+    assert run.parameter_events == ((2 * SECOND, '/go_to_goal', {'kp': 6.0}),)
 
 
-def test_a_route_is_followed_in_one_pass_over_the_odometry(monkeypatch):
-    searched = []
-    distances = timeline_module._distances
-
-    def counted(run, places, target):
-        searched.append(len(places))
-        return distances(run, places, target)
-
-    monkeypatch.setattr(timeline_module, '_distances', counted)
-    totals = []
-    for n in (500, 1000):
-        times = SECOND + np.arange(n) * SECOND // 10
-        values = np.zeros((n, 5))
-        values[:, 0], values[:, 3] = 0.1 * np.arange(n), 1.0
-        targets = values[1::2, :3]
-        run = built_run(
-            odometry=series('odometry', times, values),
-            goals=series('goals', np.full(len(targets), times[0]), targets),
-        )
-        searched.clear()
-        # The goal changes at the message at which it is reached.
-        expected = np.minimum(np.arange(n) // 2 + np.arange(n) % 2, len(targets) - 1)
-        np.testing.assert_array_equal(timeline_module.timeline(run).goal, expected)
-        totals.append(sum(searched))
-    assert totals[1] < 2.5 * totals[0]
+# --- What follows of a run
 
 
-# --- The end of reading
-
-
-class After:
-    """Becomes true with a call."""
-
-    def __init__(self, calls):
-        self.calls = calls
-
-    def __call__(self):
-        self.calls -= 1
-        return self.calls < 0
+def test_the_goal_of_a_route_changes_at_the_message_at_which_it_is_reached():
+    n = 100
+    times = SECOND + np.arange(n) * SECOND // 10
+    values = np.zeros((n, 5))
+    values[:, 0], values[:, 3] = 0.1 * np.arange(n), 1.0
+    targets = values[1::2, :3]
+    run = built_run(
+        odometry=series('odometry', times, values),
+        goals=series('goals', np.full(len(targets), times[0]), targets),
+    )
+    expected = np.minimum(np.arange(n) // 2 + np.arange(n) % 2, len(targets) - 1)
+    np.testing.assert_array_equal(timeline(run).goal, expected)
 
 
 @pytest.mark.parametrize('calls', [0, 20])
 def test_reading_and_verification_end_with_the_next_message(tmp_path, calls):
-    bag = write_bag(tmp_path / 'bag', sample(count=40))
-    after = After(calls)
-    with pytest.raises(ReadingInterruptedError):
-        read_run(bag, interrupted=after)
-    assert after.calls == -1
     stopped = [(10.01, '/cmd_vel_out', twist_stamped(0.0, 0.0, 10 * SECOND + 1))]
-    after, run = After(calls), read_run(write_bag(tmp_path / 'other', sample(stopped, count=40)))
-    with pytest.raises(ReadingInterruptedError):
-        verify(run, interrupted=after)
-    assert after.calls == -1
-    # The other tools that read bags are interrupted in `tools/test_commands`.
-    signals = Signals()
-    signals.count = 1
-    assert calibrate_run.main([str(bag), '--reference', '/odom'], signals) == 130
-    assert sorted(path.name for path in tmp_path.iterdir()) == ['bag', 'other']
+    bag = write_bag(tmp_path / 'bag', sample(stopped, count=40))
+    run = read_run(bag)
+    for function, given in ((read_run, bag), (verify, run)):
+        answers = iter([False] * calls + [True])
+        with pytest.raises(ReadingInterruptedError):
+            function(given, interrupted=lambda answers=answers: next(answers))
+        assert next(answers, None) is None

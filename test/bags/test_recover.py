@@ -7,19 +7,16 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import sqlite3
 import struct
-import subprocess
 import zlib
 from contextlib import closing
 from pathlib import Path
 
 import lz4.frame
 import pytest
-from fork_server import forked
 from rosbags.rosbag2 import CompressionMode
-from support.bags import REAL as FOREIGN
+from support.bags import REAL
 from support.raw_bags import (
     PLUGINS,
     START,
@@ -80,22 +77,13 @@ def saved(capsys, path, *arguments):
 # --- Bags of other writers
 
 
-@pytest.mark.parametrize('storage', PLUGINS)
-def test_the_other_format_and_place(run, tmp_path, capsys, storage):
-    write_without_metadata(run, storage)
-    (other,) = set(PLUGINS) - {storage}
-    assert recover(capsys, run, '-o', tmp_path / 'new', '-s', other)[0] == 0
-    assert read_bag(tmp_path / 'new') == MESSAGES
-    assert (tmp_path / 'new' / ('new.mcap' if other == 'mcap' else 'new.db3')).exists()
-
-
 def test_a_bag_of_ros2_bag_record_without_metadata_and_cut_off(run, tmp_path, capsys):
-    true = read_bag(FOREIGN)
+    true = read_bag(REAL)
     run.mkdir()
-    file = Path(shutil.copy(data_file(FOREIGN), run))
+    file = Path(shutil.copy(data_file(REAL), run))
     assert recover(capsys, run, '-o', tmp_path / 'whole')[0] == 0
     assert read_bag(tmp_path / 'whole') == true
-    assert names_of(tmp_path / 'whole') == names_of(FOREIGN)
+    assert names_of(tmp_path / 'whole') == names_of(REAL)
     os.truncate(file, 777_777)
     out, found = saved(capsys, run, '-s', 'mcap')
     assert f'lost: {file.name}: it is cut off: 365007 bytes are missing' in out
@@ -103,20 +91,19 @@ def test_a_bag_of_ros2_bag_record_without_metadata_and_cut_off(run, tmp_path, ca
     assert len(found) > 900
 
 
-@pytest.mark.parametrize('storage', PLUGINS)
-def test_a_bag_in_parts_of_which_the_last_is_cut_off(run, tmp_path, capsys, storage):
+def test_a_bag_in_parts_of_which_the_last_is_cut_off(run, tmp_path, capsys):
     """As `ros2 bag record --max-bag-size` writes it; part 10 comes after part 9."""
     run.mkdir()
-    for part in range(11):
-        file = write_without_metadata(tmp_path / 'part', storage, MESSAGES[4 * part : 4 * part + 4])
+    for number, part in enumerate((2, 9, 10)):
+        file = write_without_metadata(tmp_path / 'part', messages=MESSAGES[4 * number : 4 * number + 4])
         data = file.read_bytes()
-        (run / f'run_{part}{file.suffix}').write_bytes(data if part < 10 else data[: len(data) // 2])
+        (run / f'run_{part}.mcap').write_bytes(data if part < 10 else data[: len(data) // 2])
         shutil.rmtree(tmp_path / 'part')
     out, found = saved(capsys, run)
-    assert f'lost: run_10.{"mcap" if storage == "mcap" else "db3"}' in out
+    assert 'lost: run_10.mcap' in out
     assert 'begins before' not in out
-    assert found[:40] == MESSAGES[:40]
-    assert all(one in MESSAGES[40:44] for one in found[40:])
+    assert found[:8] == MESSAGES[:8]
+    assert found[8:] == MESSAGES[8 : len(found)]
 
 
 def test_files_that_are_copied_or_missing_are_reported(run, tmp_path, capsys):
@@ -145,58 +132,46 @@ def test_a_write_ahead_log(run, tmp_path, capsys):
     assert saved(capsys, tmp_path / 'broken')[1] == [*MESSAGES, ('/odom', *more)]
 
 
-WRITER = """
-import sys
-sys.path.insert(0, sys.argv[3])
-from support.raw_bags import make_messages, write_bag
-messages = make_messages(3_000, 3_500)
-write_bag(sys.argv[1], sys.argv[2], messages, told=lambda count: print(count, flush=True))
-"""
-
-
-@pytest.mark.process
 @pytest.mark.parametrize('storage', PLUGINS)
-def test_a_writer_that_was_killed(run, capsys, storage):
-    killed_at, messages = 1_940, make_messages(3_000, 3_500)
-    arguments = (run, storage, Path(__file__).parents[1])
-    child = forked.Popen(WRITER, arguments, stdout=subprocess.PIPE)
-    with child.stdout:
-        next(line for line in child.stdout if int(line) >= killed_at)
-        child.kill()
-    assert child.wait() == -signal.SIGKILL
-    _, found = saved(capsys, run)
-    rest = iter(messages)
+def test_what_a_writer_had_written_when_it_ended(run, tmp_path, capsys, storage):
+    """A chunk of MCAP is written per MiB, and SQLite holds back 2 MB of pages, not yet committed."""
+    messages, size, ended_at = make_messages(1_500, 7_000), 7_000, 1_000
+
+    def copy(count):
+        if count == ended_at:
+            shutil.copytree(run, tmp_path / 'broken')
+
+    write_bag(run, storage, messages, told=copy)
+    _, found = saved(capsys, tmp_path / 'broken')
+    rest = iter(messages[:ended_at])
     assert all(one in rest for one in found)
-    # A chunk of MCAP is written per MiB, and SQLite holds back 2 MB of pages.
-    assert len(found) >= killed_at - 1_600
+    assert len(found) >= ended_at - 2 * 2_500_000 // size
     assert {topic for topic, _, _ in found} == set(TOPICS)
+
+
+def test_compressed_files_are_unpacked(run, capsys):
+    write_bag(run, 'mcap', MESSAGES, CompressionMode.FILE)
+    (run / 'metadata.yaml').unlink()
+    assert saved(capsys, run)[1] == MESSAGES
 
 
 # --- Damage with a name
 
 
-def test_a_chunk_with_a_wrong_checksum_is_saved_and_reported(ours, capsys):
-    edit(ours / 'run.mcap', lambda data: data.__setitem__(data.index(MESSAGES[30][2]) + 20, 0x55))
-    out, found = saved(capsys, ours)
-    assert 'lost: run.mcap: a chunk of' in out
-    assert 'its messages may be altered' in out
-    assert sum(one != other for one, other in zip(found, MESSAGES, strict=True)) == 1
-
-
 def test_the_end_of_an_sqlite_file_that_became_zeros(run, capsys):
-    file = write_without_metadata(run, 'sqlite3', make_messages(400, 1000))
+    messages = make_messages(100, 1000)
+    file = write_without_metadata(run, 'sqlite3', messages)
     size = file.stat().st_size
     left, pages = 2 * size // 3 // PAGE, size // PAGE
     edit(file, lambda data: data.__setitem__(slice(left * PAGE, size), bytes(size - left * PAGE)))
     out, found = saved(capsys, run)
     assert f'lost: run.db3: {pages - left} of its {pages} pages are empty' in out
-    assert found == make_messages(400, 1000)[: len(found)]
+    assert found == messages[: len(found)]
 
 
 def test_messages_of_zeros_are_no_empty_pages(run, capsys):
     """A black picture fills whole pages with zeros."""
-    topic = next(iter(TOPICS))
-    messages = [(topic, 1000 + index, b'\0\1\0\0' + bytes(20_000)) for index in range(10)]
+    messages = [('/odom', 1000 + index, b'\0\1\0\0' + bytes(20_000)) for index in range(10)]
     data = write_without_metadata(run, 'sqlite3', messages).read_bytes()
     assert bytes(PAGE) in {data[at : at + PAGE] for at in range(0, len(data), PAGE)}
     out, found = saved(capsys, run)
@@ -204,24 +179,12 @@ def test_messages_of_zeros_are_no_empty_pages(run, capsys):
     assert 'lost: ' not in out
 
 
-def test_a_length_beyond_all_positions(run, capsys):
-    """Of an attachment, which is skipped, so that the length becomes a position in the file."""
-    file = write_without_metadata(run)
-    edit(
-        file,
-        lambda data: struct.pack_into('<BQ', data, data.index(MESSAGES[30][2]) - 31, 9, 2**64 - 1),
-    )
-    out, found = saved(capsys, run)
-    assert 'bytes of a chunk are not complete records' in out
-    assert found == MESSAGES[:30]
-
-
 @pytest.mark.parametrize(
     ('name', 'compress'), [('lz4', lz4.frame.compress), ('zstd', bounded_reader.zstd.compress)]
 )
 def test_cuts_in_a_compressed_chunk(run, tmp_path, capsys, name, compress):
     """As rosbag2 writes chunks: what comes before the cut can be unpacked, as far as whole blocks go."""
-    messages = make_messages(1000, 1900)
+    messages = make_messages(400, 1900)
     data = write_without_metadata(run, messages=messages).read_bytes()
     head = next(start for opcode, start, _ in mcap_records(data) if opcode == CHUNK)
     _, _, start, end, size, _, _, _ = struct.unpack_from('<BQQQQIIQ', data, head)
@@ -229,7 +192,7 @@ def test_cuts_in_a_compressed_chunk(run, tmp_path, capsys, name, compress):
     packed = compress(content)
     chunk = struct.pack('<QQQII', start, end, size, zlib.crc32(content), len(name)) + name.encode()
     chunk += struct.pack('<Q', len(packed)) + packed
-    for part in (0.0, 0.5, 1.0):
+    for part in (0.0, 0.7, 1.0):
         left = int(part * len(packed)) + len(chunk) - len(packed)
         broken = tmp_path / f'{part}.mcap'
         broken.write_bytes(data[:head] + struct.pack('<BQ', 6, len(chunk)) + chunk[:left])
@@ -304,16 +267,6 @@ def test_written_checksums(ours):
     assert checksum == zlib.crc32(data[summary : footer + 25])
 
 
-def test_the_mcap_library_accepts_the_checksums(ours):
-    reader = pytest.importorskip('mcap.stream_reader').StreamReader
-    with open(ours / 'run.mcap', 'rb') as file:
-        names = [type(one).__name__ for one in reader(file, validate_crcs=True).records]
-    assert names.count('Message') == len(MESSAGES)
-    edit(ours / 'run.mcap', lambda data: data.__setitem__(len(data) // 2, data[len(data) // 2] ^ 1))
-    with open(ours / 'run.mcap', 'rb') as file, pytest.raises(Exception, match='crc'):
-        list(reader(file, validate_crcs=True).records)
-
-
 def test_what_a_complete_bag_needs(ours, capsys):
     """Checksums of its chunks and counts, as `ros2 bag record` writes them."""
     file = ours / 'run.mcap'
@@ -348,7 +301,6 @@ def test_a_bag_without_checksums_cannot_be_called_complete(run, capsys, storage)
         (STATISTICS, 9 + 46 + 2, 'its statistics count '),
         (STATISTICS, 9 + 46 + 2, 'the checksum of its summary is wrong'),
         (METADATA, 30, 'the checksum of its data section is wrong'),
-        (CHUNK, 60, 'the checksum of its data section is wrong'),
         (CHUNK, 200, 'a chunk of '),
     ],
 )
@@ -388,45 +340,26 @@ def test_wrong_counts_are_noticed_without_checksums(run, tmp_path, capsys):
 # --- What is refused
 
 
-def assert_refused(capsys, folder, arguments, code, *words):
-    """Run the tool, and check its exit code and its one line. No file may change."""
-
-    def files():
-        return {path: contents(path) for path in (folder, *folder.iterdir()) if path.is_dir()}
-
-    before = files()
-    found, out, err = recover(capsys, *arguments)
-    assert (found, out) == (code, '')
-    assert len(err.splitlines()) == 1
-    for word in ('recover_run: ', *words):
-        assert word in err
-    assert files() == before
-
-
-def test_what_is_no_bag(tmp_path, capsys):
-    for name in ('empty', 'other', 'others'):
+def test_what_holds_nothing_of_a_bag_and_places_that_cannot_be_written(run, tmp_path, capsys):
+    for name in ('other', 'others'):
         (tmp_path / name).mkdir()
     (tmp_path / 'other' / 'notes.txt').write_text('no bag')
     write_journal(tmp_path / 'others' / 'run', [])
-    for name, words in {
-        'nothing': ('there is no bag', 'nothing.journal.mcap'),
-        'others': ('holds no files of a bag but journals (*.journal.mcap)',),
-        'empty': ('is an empty folder',),
-        'other': ('holds neither .mcap nor .db3 files',),
-        'other/notes.txt': ('is neither MCAP nor SQLite',),
-    }.items():
-        assert_refused(capsys, tmp_path, [tmp_path / name], 2, *words)
-
-
-def test_output_that_exists_or_cannot_be_written(run, tmp_path, capsys):
     write_without_metadata(run)
-    (tmp_path / 'file').write_text('dear')
-    (tmp_path / 'run_recovered').mkdir()
-    for options in ((), ('-o', tmp_path / 'file')):
-        assert_refused(capsys, tmp_path, [run, *options], 2, 'exists already')
-    # Nobody may make a directory there, not even root.
-    for place in ('/sys/new', tmp_path / 'file' / 'new'):
-        assert_refused(capsys, tmp_path, [run, '-o', place], 2, 'no bag was written')
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob('*')}
+    for arguments, words in (
+        (['nothing'], 'nothing.journal.mcap'),
+        (['others'], 'holds no files of a bag but journals (*.journal.mcap)'),
+        (['other'], 'holds neither .mcap nor .db3 files'),
+        # Nobody may make a directory there, not even root.
+        (['run', '-o', '/sys/new'], 'no bag was written'),
+        (['run', '-o', tmp_path / 'other' / 'notes.txt' / 'new'], 'no bag was written'),
+    ):
+        code, out, err = recover(capsys, tmp_path / arguments[0], *arguments[1:])
+        assert (code, out) == (2, '')
+        assert words in err
+        assert len(err.splitlines()) == 1
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob('*')} == before
 
 
 def test_topics_of_unknown_types_are_left_out(run, capsys):
@@ -441,10 +374,3 @@ def test_topics_of_unknown_types_are_left_out(run, capsys):
     assert 'lost: /cmd_vel is left out: no installed package defines my_msgs/msg/Mine' in out
     assert read_bag(run.with_name('run_recovered')) == [one for one in MESSAGES if one[0] == '/odom']
     assert contents(run) == before
-
-
-def test_compressed_files_and_messages_are_unpacked(run, capsys):
-    """The other modes are those of `test_damage_fuzz`."""
-    write_bag(run, 'mcap', MESSAGES, CompressionMode.FILE)
-    (run / 'metadata.yaml').unlink()
-    assert saved(capsys, run)[1] == MESSAGES

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_srvs.srv import Trigger
-from support.bags import REAL as FOREIGN
+from support.bags import REAL
 from support.lockstep_nodes import change
 from support.lockstep_nodes import make_complete as make
 from support.recorded import recorded
@@ -53,12 +53,14 @@ def rows(series, keep):
     )
 
 
+NOTHING = slice(0, 0)
+COUNT = 100
+"""Odometry messages of a drive."""
 LIMITS = {'linear__x__max_velocity': 0.1, 'angular__z__max_velocity': 0.5, 'max_wheel_velocity': 3.0}
 ROBOTS = {
     'twist': {},
     'wheels': {'command_interface': 'wheels'},
-    'limits': LIMITS,
-    'placed': {'publish_rate': 333.0, 'x': 4.0, 'y': -1.0, 'theta': 2.0},
+    'limits': {**LIMITS, 'publish_rate': 333.0, 'x': 4.0, 'y': -1.0, 'theta': 2.0},
 }
 
 
@@ -76,8 +78,15 @@ def drives(tmp_path_factory):
             world.add(make(GoToGoal))
             with recorded(world, tmp_path_factory.mktemp('runs') / 'run') as made:
                 world.publish('goals', goals(goal(0.5, 0.2), goal(-0.3, 0.4)))
-                world.run_for(200.0 / parameters.get('publish_rate', 50.0))
-        return _frozen(made.run)
+                world.run_for(COUNT / parameters.get('publish_rate', 50.0))
+        # Tests share it.
+        for field in fields(made.run):
+            value = getattr(made.run, field.name)
+            is_series = isinstance(value, Series)
+            for array in (value.received, value.stamps, value.values) if is_series else (value,):
+                if isinstance(array, np.ndarray):
+                    array.setflags(write=False)
+        return made.run
 
     return drive
 
@@ -88,15 +97,21 @@ def run(drives):
     return drives('twist')
 
 
-def _frozen(run):
-    """Make the arrays of a run read-only, because tests share it."""
-    for field in fields(run):
-        value = getattr(run, field.name)
-        is_series = isinstance(value, Series)
-        for array in (value.received, value.stamps, value.values) if is_series else (value,):
-            if isinstance(array, np.ndarray):
-                array.setflags(write=False)
-    return run
+@pytest.fixture
+def driven(lockstep, tmp_path):
+    """A function that records while a robot gets commands, each for some seconds; returns the run."""
+
+    def drive(commands, seconds, rest=0.0):
+        with recorded(lockstep, tmp_path / 'run') as made:
+            made.look()
+            for v, omega in commands:
+                lockstep.publish('cmd_vel', twist(v, omega))
+                lockstep.run_for(seconds)
+            if rest:
+                lockstep.run_for(rest)
+        return made.run
+
+    return drive
 
 
 @pytest.mark.parametrize('name', ROBOTS)
@@ -104,11 +119,11 @@ def test_a_run_is_driven_again_exactly(drives, name):
     run = drives(name)
     verification = held(run)
     assert (verification.source, verification.start) == ('cmd_vel_out', 'start_pose')
-    assert len(verification.seconds) == len(run.odometry) > 190
-    assert np.ptp(run.odometry.values[:, 0]) > (0.05 if name == 'placed' else 0.2)
-    if name != 'placed':
+    assert len(verification.seconds) == len(run.odometry) > COUNT - 10
+    assert np.ptp(run.odometry.values[:, 0]) > (0.01 if name == 'limits' else 0.2)
+    if name != 'limits':
         # Without cmd_vel_out the commands are taken by their recording.
-        verification = held(replace(run, cmd_vel_out=rows(run.cmd_vel_out, slice(0, 0))))
+        verification = held(replace(run, cmd_vel_out=rows(run.cmd_vel_out, NOTHING)))
         assert verification.source == ('joint_command' if name == 'wheels' else 'cmd_vel')
         assert verification.start == 'odometry'
 
@@ -122,29 +137,29 @@ def test_messages_that_are_there_twice_do_not_turn_back_time(run):
 
 
 def test_placements_resets_timeouts_and_parameters_are_driven_again(lockstep, robot_at, tmp_path):
-    robot = robot_at(cmd_vel_timeout=0.3)
+    robot = robot_at(cmd_vel_timeout=0.15)
     with recorded(lockstep, tmp_path / 'run') as made:
         made.look()
         lockstep.publish('cmd_vel', twist(0.5, 1.0))
-        lockstep.run_for(1.0)
+        lockstep.run_for(0.5)
         placed = PoseWithCovarianceStamped()
         placed.pose.pose = goal(3.0, 3.0, -2.0).pose
         lockstep.publish('cmd_vel', twist(-0.5, 2.0))
         lockstep.run_for(0.1)
         lockstep.publish('initialpose', placed)
-        lockstep.run_for(0.5)
+        lockstep.run_for(0.3)
         lockstep.publish('cmd_vel', twist(1.0, 0.1))
         change(robot, linear__x__max_velocity=0.2)
-        lockstep.run_for(0.2)
+        lockstep.run_for(0.1)
         lockstep.call(Trigger, 'reset_odometry')
-        lockstep.run_for(0.5)
+        lockstep.run_for(0.3)
     run = made.run
     assert len(run.start_pose) == 3
     assert run.parameter_events[-1][2] == {'linear.x.max_velocity': 0.2}
     held(run)
 
 
-def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(lockstep, robot_at, tmp_path):
+def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(robot_at, driven):
     robot_at(
         linear__x__max_acceleration=0.5,
         linear__x__max_deceleration=-0.8,
@@ -153,26 +168,19 @@ def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(lockstep, r
         command_delay=0.05,
         max_wheel_acceleration=20.0,
     )
-    with recorded(lockstep, tmp_path / 'run') as made:
-        made.look()
-        for v, omega in ((0.5, 1.0), (-0.3, 1.0), (0.4, -2.0), (0.0, 0.0), (0.3, 0.3)):
-            lockstep.publish('cmd_vel', twist(v, omega))
-            lockstep.run_for(0.43)
-        lockstep.run_for(0.8)
-    run = made.run
+    run = driven(((0.5, 1.0), (-0.3, 1.0), (0.4, -2.0), (0.0, 0.0), (0.3, 0.3)), 0.23, rest=0.6)
     verification = held(run, 1e-12)
     assert (verification.source, verification.start) == ('cmd_vel_out', 'start_pose')
     assert verification.covariance_difference <= COVARIANCE_TOLERANCE
     without = verify(replace(run, parameters={}))
     assert without.distances.max() > 0.01
     assert 'cannot be reproduced without them' in without.notes[-1]
-    late = replace(run, start_pose=rows(run.start_pose, slice(0, 0)))
+    late = replace(run, start_pose=rows(run.start_pose, NOTHING))
     assert any('what it was commanded before is missing' in note for note in verify(late).notes)
 
 
 def test_changes_of_the_dynamics_are_driven_again(lockstep, robot_at, tmp_path):
     robot = robot_at(linear__x__max_acceleration=0.4, command_delay=0.13)
-
     with recorded(lockstep, tmp_path / 'run') as made:
         made.look()
         for v, changes in (
@@ -192,7 +200,7 @@ def test_changes_of_the_dynamics_are_driven_again(lockstep, robot_at, tmp_path):
             lockstep.publish('cmd_vel', twist(-v, 0.5))
             change(robot, angular__z__max_acceleration=2.0 + v)
             lockstep.publish('cmd_vel', twist(v, -0.5))
-            lockstep.run_for(0.2)
+            lockstep.run_for(0.1)
     run = made.run
     assert len(run.parameter_stamps) == len(run.parameter_events) >= 12
     held(run, 1e-12)
@@ -200,19 +208,16 @@ def test_changes_of_the_dynamics_are_driven_again(lockstep, robot_at, tmp_path):
 
 
 @pytest.mark.parametrize('limits', [{}, {'linear__x__max_acceleration': 0.5, 'wheel_lag': 0.05}])
-def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, tmp_path, limits):
+def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, driven, limits):
     robot_at(**limits)
     lockstep.inject(
-        ActuatorLag(0.2, start=0.3, duration=0.9),
-        DeadWheel('left', start=0.5, duration=1.0),
-        SaturatedWheel('right', 3.5, start=0.2, duration=1.5),
-        ActuatorLag(0.1, start=1.0),
+        ActuatorLag(0.2, start=0.1, duration=0.5),
+        DeadWheel('left', start=0.3, duration=0.5),
+        SaturatedWheel('right', 3.5, start=0.2, duration=0.8),
+        # At the end of the first one.
+        ActuatorLag(0.1, start=0.6),
     )
-    with recorded(lockstep, tmp_path / 'run') as made:
-        for number in range(9):
-            lockstep.publish('cmd_vel', twist(0.3, (-1) ** number))
-            lockstep.run_for(0.25)
-    run = made.run
+    run = driven([(0.3, (-1) ** number) for number in range(6)], 0.2)
     held(run, 1e-12)
     of_another = tuple((at, f"{fault[:-1]}, robot='/b')", what) for at, fault, what in run.fault_events)
     assert verify(replace(run, fault_events=of_another)).distances.max() > 0.01
@@ -221,58 +226,47 @@ def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, tmp_path, lim
     assert 'record /fault_events' in without.notes[-1]
 
 
-def test_time_that_goes_back_is_followed(lockstep, robot_at, tmp_path):
+def test_time_that_goes_back_is_followed(robot_at, driven):
     robot_at()
-    with recorded(lockstep, tmp_path / 'run') as made:
-        lockstep.publish('cmd_vel', twist(0.5, 1.0))
-        lockstep.run_for(0.4)
-    run = made.run
+    run = driven([(0.5, 1.0)], 0.4)
     shifted = replace(run.odometry, stamps=run.odometry.stamps - 10**9)
-    start = rows(run.start_pose, slice(-1, None))
-    begun = replace(
-        start,
-        stamps=shifted.stamps[:1],
-        values=shifted.values[:1, :3],
-        received=run.odometry.received[-1:],
-    )
-    received = begun.received + 1
-    moving = run.odometry.values[:1, 3:]
+    last = run.odometry.received[-1:]
+    first, moving = run.odometry.values[:1, :3], run.odometry.values[:1, 3:]
 
-    def again(twists):
-        commands = replace(run.cmd_vel_out, stamps=shifted.stamps[:1], values=twists, received=received)
+    def joined(one, **other):
         return replace(
-            run,
-            odometry=_joined(run.odometry, replace(shifted, received=shifted.received + 10**9)),
-            start_pose=_joined(run.start_pose, begun),
-            cmd_vel_out=_joined(run.cmd_vel_out, commands),
+            one, **{name: np.concatenate([getattr(one, name), other[name]]) for name in other}
         )
 
-    assert np.any(np.diff(again(moving).odometry.stamps) < 0)
+    def again(twists):
+        begun = shifted.stamps[:1]
+        return replace(
+            run,
+            odometry=joined(
+                run.odometry,
+                received=run.odometry.received + 10**9,
+                stamps=shifted.stamps,
+                values=shifted.values,
+            ),
+            start_pose=joined(run.start_pose, received=last, stamps=begun, values=first),
+            cmd_vel_out=joined(run.cmd_vel_out, received=last + 1, stamps=begun, values=twists),
+        )
+
     assert len(held(again(moving)).seconds) == 2 * len(run.odometry)
     stood = verify(again(0.0 * moving))
     assert stood.distances[: len(run.odometry)].max() < EXACT
     assert stood.distances[-1] > 0.1
 
 
-def _joined(first, second):
-    return replace(
-        first,
-        **{
-            name: np.concatenate([getattr(first, name), getattr(second, name)])
-            for name in ('received', 'stamps', 'values')
-        },
-    )
-
-
 @pytest.mark.lockstep(start=100.0)
 def test_late_stamped_commands_are_explained(lockstep, robot_at, tmp_path):
     robot_at(enable_stamped_cmd_vel=True)
     with recorded(lockstep, tmp_path / 'run') as made:
-        for index in range(20):
+        for index in range(10):
             lockstep.run_for(0.05)
             late = lockstep.now - 30_000_000
             lockstep.publish('cmd_vel', twist_stamped(0.5, (-1) ** index, late))
-    assert len(made.run.cmd_vel_out) == 20
+    assert len(made.run.cmd_vel_out) == 10
     held(made.run)
 
 
@@ -294,10 +288,6 @@ def test_a_recording_that_begins_late_is_verified_from_its_first_odometry(
     driven = replace(made.run, odometry=rows(made.run.odometry, slice(20, None)))
     driven = replace(driven, odometry_covariances=made.run.odometry_covariances[20:])
     assert held(driven).start == 'odometry'
-    with recorded(lockstep, tmp_path / 'late') as made:
-        lockstep.publish('cmd_vel', twist(0.3, -0.7))
-        lockstep.run_for(0.3)
-    assert held(made.run).start == 'odometry'
 
 
 def test_after_a_reset_of_the_odometry_alone_the_truth_has_no_known_start(lockstep, robot_at, tmp_path):
@@ -309,7 +299,7 @@ def test_after_a_reset_of_the_odometry_alone_the_truth_has_no_known_start(lockst
     with recorded(lockstep, tmp_path / 'run') as made:
         lockstep.run_for(0.1)
         lockstep.publish('cmd_vel', twist(0.1, 0.9))
-        lockstep.run_for(0.5)
+        lockstep.run_for(0.3)
         lockstep.publish('initialpose', PoseWithCovarianceStamped())
         lockstep.run_for(0.1)
     verification = held(made.run)
@@ -322,19 +312,17 @@ def test_what_was_altered_is_found_with_its_place(run):
     odometry = run.odometry
     commands = run.cmd_vel_out
     seconds = (commands.stamps - odometry.stamps[0]) / 1e9
-    gap = verify(replace(run, cmd_vel_out=rows(commands, (seconds < 1.0) | (seconds > 1.5))))
+    gap = verify(replace(run, cmd_vel_out=rows(commands, (seconds < 0.5) | (seconds > 1.0))))
     assert not gap.holds(EXACT, EXACT)
     first = gap.seconds[np.flatnonzero(gap.distances > EXACT)[0]]
-    assert 1.0 <= first <= 1.1
-    scaled = odometry.values * [1.01, 1.01, 1.0, 1.0, 1.0]
-    assert not verify(replace(run, odometry=replace(odometry, values=scaled))).holds(EXACT, EXACT)
+    assert 0.5 <= first <= 0.6
     for column, differences in ((0, 'distances'), (1, 'distances'), (2, 'headings')):
         altered = odometry.values.copy()
-        altered[123, column] += 1e-3
+        altered[73, column] += 1e-3
         found = verify(replace(run, odometry=replace(odometry, values=altered)))
         assert not found.holds(EXACT, EXACT)
         assert found.seconds[getattr(found, differences).argmax()] == pytest.approx(
-            (odometry.stamps[123] - odometry.stamps[0]) / 1e9
+            (odometry.stamps[73] - odometry.stamps[0]) / 1e9
         )
         assert getattr(found, differences).max() == pytest.approx(1e-3)
 
@@ -345,34 +333,17 @@ def test_a_recorder_that_missed_the_first_commands_does_not_blame_the_robot(run,
     found = held(late)
     assert any('moved before the first command that was recorded' in note for note in found.notes)
     assert found.start == 'odometry'
-    assert len(found.distances) >= len(run.odometry) - missed - 100
+    assert len(found.distances) >= len(run.odometry) - missed - 20
     assert not any('before the first command' in note for note in held(run).notes)
 
 
-def test_a_bag_of_ros2_bag_record_is_held_against_our_robot():
-    run = read_run(FOREIGN)
+def test_a_bag_of_ros2_bag_record_is_verified_against_our_robot():
+    run = read_run(REAL)
     verification = held(run, 0.02)
-    # That robot integrates by midpoints at 100 Hz; its commands' true instants are not known.
+    # That robot integrates by midpoints at 100 Hz; the true times of its commands are not known.
     assert 1e-4 < verification.distances.max() < 2e-3
     slower = verify(run, {'linear.x.max_velocity': 0.05})
     assert not slower.holds(0.02, 0.02)
-
-
-def test_runs_that_cannot_be_verified_say_why(run):
-    nothing = slice(0, 0)
-    with pytest.raises(BagError, match='no odometry'):
-        verify(replace(run, odometry=rows(run.odometry, nothing)))
-    stopped = replace(run.odometry, received=0 * run.odometry.received)
-    with pytest.raises(BagError, match='clock of the recorder stood still'):
-        verify(replace(run, odometry=stopped))
-    shuffled = replace(
-        run.odometry, stamps=run.odometry.stamps - 10**9 * (np.arange(len(run.odometry)) % 2)
-    )
-    with pytest.raises(BagError, match='record without use_sim_time'):
-        verify(replace(run, odometry=shuffled))
-    silent = replace(run, cmd_vel_out=rows(run.cmd_vel_out, nothing), cmd_vel=rows(run.cmd_vel, nothing))
-    with pytest.raises(BagError, match='has no commands: record cmd_vel_out, or cmd_vel'):
-        verify(silent)
 
 
 def still(count=100, begin=10**9, step=10**8, **keywords):
@@ -380,38 +351,32 @@ def still(count=100, begin=10**9, step=10**8, **keywords):
     return series('odometry', begin + step * np.arange(count), np.zeros((count, 5)), **keywords)
 
 
-def test_the_time_is_linear_where_all_commands_were_recorded_late(monkeypatch):
-    computed = []
-    at = Robot.at
-    monkeypatch.setattr(Robot, 'at', lambda self, stamp: computed.append(stamp) or at(self, stamp))
-    calls = []
-    for n in (200, 400):
-        odometry = still(n, step=1000)
-        late = series('cmd_vel_out', odometry.stamps, np.full((n, 2), 0.1), odometry.stamps + 10**9)
-        computed.clear()
-        verify(built_run(odometry=odometry, cmd_vel_out=late))
-        calls.append(len(computed))
-    assert calls[1] < 2.1 * calls[0]
-
-
-@pytest.mark.parametrize('ahead', [10**18, -(10**18)], ids=['recorder', 'robot'])
-def test_times_of_another_clock_than_the_odometry_are_refused(ahead):
-    stamps = 2 * 10**18 + 10**8 * np.arange(100)
-    odometry = still(begin=2 * 10**18, received=stamps + ahead)
-    commands = series('cmd_vel', stamps + ahead, np.full((100, 2), 0.5))
-    with pytest.raises(BagError, match='another clock than the stamps of the odometry'):
-        verify(built_run(odometry=odometry, cmd_vel=commands))
-    applied = series('cmd_vel_out', stamps[50:] + ahead, np.full((50, 2), 0.5), stamps[50:])
-    with pytest.raises(BagError, match='no odometry after the first command on cmd_vel_out'):
-        verify(built_run(odometry=still(begin=2 * 10**18), cmd_vel_out=applied))
-
-
-@pytest.mark.parametrize('topic', ['cmd_vel', 'cmd_vel_out'])
-def test_odometry_must_follow_a_command(topic):
-    odometry = still()
-    late = series(topic, odometry.stamps[-1:] + 1, [[0.5, 0.3]])
-    with pytest.raises(BagError, match=f'no odometry after the first command on {topic}'):
-        verify(built_run(odometry=odometry, **{topic: late}))
+def test_runs_that_cannot_be_verified_say_why(run):
+    odometry, stamps = run.odometry, 2 * 10**18 + 10**8 * np.arange(100)
+    stopped = replace(odometry, received=0 * odometry.received)
+    shuffled = replace(odometry, stamps=odometry.stamps - 10**9 * (np.arange(len(odometry)) % 2))
+    silent = replace(run, cmd_vel_out=rows(run.cmd_vel_out, NOTHING), cmd_vel=rows(run.cmd_vel, NOTHING))
+    cases = [
+        (replace(run, odometry=rows(odometry, NOTHING)), 'no odometry'),
+        (replace(run, odometry=stopped), 'clock of the recorder stood still'),
+        (replace(run, odometry=shuffled), 'record without use_sim_time'),
+        (silent, 'has no commands: record cmd_vel_out, or cmd_vel'),
+    ]
+    for ahead in (10**18, -(10**18)):
+        commands = series('cmd_vel', stamps + ahead, np.full((100, 2), 0.5))
+        late = still(begin=2 * 10**18, received=stamps + ahead)
+        of_another = built_run(odometry=late, cmd_vel=commands)
+        cases.append((of_another, 'another clock than the stamps of the odometry'))
+        applied = series('cmd_vel_out', stamps[50:] + ahead, np.full((50, 2), 0.5), stamps[50:])
+        of_another = built_run(odometry=still(begin=2 * 10**18), cmd_vel_out=applied)
+        cases.append((of_another, 'no odometry after the first command on cmd_vel_out'))
+    for topic in ('cmd_vel', 'cmd_vel_out'):
+        late = series(topic, still().stamps[-1:] + 1, [[0.5, 0.3]])
+        last = built_run(odometry=still(), **{topic: late})
+        cases.append((last, f'no odometry after the first command on {topic}'))
+    for given, words in cases:
+        with pytest.raises(BagError, match=words):
+            verify(given)
 
 
 def test_odometry_that_was_not_compared_is_counted():
@@ -424,6 +389,13 @@ def test_odometry_that_was_not_compared_is_counted():
     )
 
 
+def test_commands_that_precede_the_odometry_are_passed_over():
+    odometry = still()
+    stamps = [*(odometry.stamps[:3] - 10**9), *odometry.stamps]
+    commands = series('cmd_vel', stamps, [[1.0, 0.0]] * 3 + [[0.0, 0.0]] * 100)
+    assert verify(built_run(odometry=odometry, cmd_vel=commands)).holds(0.0, 0.0)
+
+
 # --- The covariance
 
 
@@ -432,11 +404,11 @@ def test_the_covariances_are_those_of_the_node_to_the_last_bit(lockstep, robot_a
     with recorded(lockstep, tmp_path / 'run') as made:
         made.look()
         lockstep.publish('cmd_vel', twist(0.2, 1.0))
-        lockstep.run_for(1.0)
+        lockstep.run_for(0.5)
         placed = PoseWithCovarianceStamped()
         placed.pose.covariance[0] = placed.pose.covariance[7] = placed.pose.covariance[35] = 0.04
         lockstep.publish('initialpose', placed)
-        for turn in range(0, 40, 4):
+        for turn in range(0, 40, 8):
             lockstep.publish('cmd_vel', twist(-0.2, 0.1 * turn))
             lockstep.run_for(0.1)
     run = made.run
@@ -444,9 +416,8 @@ def test_the_covariances_are_those_of_the_node_to_the_last_bit(lockstep, robot_a
     assert verification.covariance_difference == 0.0
     # The heading of the start is exactly zero, so that no digit is lost in the quaternion.
     assert run.odometry_covariances[-1, 5] > 0.04
-
     forged = run.odometry_covariances.copy()
-    forged[70, 3] *= 1.0 + 1e-6
+    forged[40, 3] *= 1.0 + 1e-6
     verification = verify(replace(run, odometry_covariances=forged))
     assert verification.covariance_difference > COVARIANCE_TOLERANCE
     assert not verification.holds(EXACT, EXACT)
@@ -454,9 +425,8 @@ def test_the_covariances_are_those_of_the_node_to_the_last_bit(lockstep, robot_a
 
 @pytest.mark.parametrize('missing', ['parameters', 'start_pose'])
 def test_without_the_robot_or_its_start_the_covariances_are_not_compared(run, missing):
-    without = {} if missing == 'parameters' else rows(run.start_pose, slice(0, 0))
-    verification = held(replace(run, **{missing: without}))
-    assert verification.covariance_difference is None
+    without = {} if missing == 'parameters' else rows(run.start_pose, NOTHING)
+    assert held(replace(run, **{missing: without})).covariance_difference is None
 
 
 def test_covariances_are_compared_in_units_of_their_standard_deviations():

@@ -90,10 +90,12 @@ def channel(number, topic, type_name, qos=()):
 
 
 def write_records(bag, *records):
-    """Write the journal of a bag; return its path."""
+    """Write the journal of a bag, with a chunk for every few records; return its path."""
     with closing(JournalWriter(journal_of(bag))) as writer:
-        for record in records:
+        for number, record in enumerate(records, 1):
             writer.add(record)
+            if number % 16 == 0:
+                writer.flush()
         writer.flush()
     return writer.path
 
