@@ -143,12 +143,3 @@ def moving(world, case):
     """Change the working directory, and fail."""
     os.chdir('/')
     raise ValueError('moved')
-
-
-def loaded(world, case):
-    """Fail if a process that only runs worlds has imported what it does not need."""
-    import diffdrive_jacobian.testing
-
-    assert diffdrive_jacobian.testing.Lockstep is type(world)
-    unneeded = {'hypothesis', 'matplotlib', 'pytest'} & set(sys.modules)
-    assert not unneeded, unneeded

@@ -16,7 +16,7 @@ from threading import Thread
 
 import numpy as np
 import pytest
-from exploration_scenarios import crowded, deadly, follow, loaded, nothing, serial
+from exploration_scenarios import crowded, deadly, follow, nothing, serial
 from hypothesis import strategies as st
 
 from diffdrive_jacobian import signals
@@ -38,7 +38,6 @@ FOLLOW = {
 }
 SPEEDS = st.fixed_dictionaries({'speed': st.sampled_from([0.0, 1.0, 2.0])})
 SETUP = SweepSetup(grid=3, starts=2, rate=20.0)
-PYTHON = sys.executable
 
 
 @pytest.fixture(autouse=True)
@@ -107,13 +106,6 @@ def test_random_numbers_of_other_threads_do_not_end_the_generation_of_worlds():
 
     cases = st.integers(0, 5).map(use_random_numbers)
     assert serial(nothing, cases=cases, worlds=1).worlds == 1
-
-
-def test_processes_of_worlds_import_little(monkeypatch):
-    monkeypatch.setattr(sys, 'executable', PYTHON)
-    with LocalExecutor(1) as executor:
-        found = explore(loaded, worlds=1, executor=executor)
-    assert not found.findings, str(found)
 
 
 def test_a_process_that_dies_is_a_finding(local, tmp_path):
