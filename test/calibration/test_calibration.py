@@ -164,9 +164,9 @@ def test_umbmark_recovers_the_true_multipliers_and_the_noise():
 
 @pytest.mark.slow
 def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance():
-    """A small form of `benchmark/calibration_cases.py`: mean squares of 10 robots."""
+    """A small form of `benchmark/calibration_cases.py`: mean squares of 8 robots."""
     errors, nees, bounds, places = [], [], [], []
-    count = 10
+    count = 8
     for seed in range(count):
         result = calibrate([ROBOT.recording(np.random.default_rng(100 + seed))], NOMINAL)
         error = result.multipliers - TRUE
@@ -345,7 +345,7 @@ def test_wheels_are_located_between_the_steps_of_their_encoders():
 def test_few_steps_make_the_multipliers_uncertain_and_not_wrong():
     random = np.random.default_rng(21)
     drive = Drive.of(with_stops(umbmark(side=1.0, runs=1, speed=0.4, turn=2.0)))
-    robot = replace(ROBOT, drive=drive, rate=15)
+    robot = replace(ROBOT, drive=drive, rate=20)
     errors, nees, widths = [], [], []
     count = 2
     for _ in range(count):
