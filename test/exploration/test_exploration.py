@@ -23,7 +23,7 @@ from exploration_scenarios import (
 from hypothesis import strategies as st
 from support import inner_sessions  # noqa: F401  What it imports is not imported again.
 
-from diffdrive_jacobian.faults import Delay, Hang, Loss
+from diffdrive_jacobian.faults import Hang, Loss
 from diffdrive_jacobian.properties import NeverFasterThan
 from diffdrive_jacobian.testing import (
     ExplorationError,
@@ -35,7 +35,7 @@ from diffdrive_jacobian.testing import (
 
 pytestmark = pytest.mark.slow
 SLOW = NeverFasterThan(0.75, 1.0)
-LOSSES = fault_schedules(['speed'], kinds=[Loss, Delay], max_faults=2, duration=1.2)
+LOSSES = fault_schedules(['speed'], kinds=[Loss], max_faults=2, duration=1.2)
 SPEEDS = {'speed': numbers(0.0, 5.0)}
 
 
