@@ -246,14 +246,16 @@ def test_wheels_that_are_given_are_not_looked_for():
 # --- Mistakes
 
 
-def test_a_straight_drive_is_refused_in_words(folder):
+def test_straight_and_short_drives_are_refused_in_words(folder):
     straight = drive((1.0, 0.0, 0.0), (10.0, 0.4, 0.0), (1.0, 0.0, 0.0), seed=3)
     write(folder / 'straight', bag_messages(straight))
     out, message = failed('straight')
     assert 'does not determine the wheel separation: turn in place' in message
     assert 'Nothing was written' in message
     assert 'left_wheel_radius_multiplier' in out
-    assert left(folder) == ['straight']
+    write(folder / 'short', bag_messages(drive((1.0, 0.2, 0.5))))
+    assert 'too short' in failed('short')[1]
+    assert left(folder) == ['short', 'straight']
 
 
 @pytest.mark.parametrize(
