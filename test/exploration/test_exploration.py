@@ -155,7 +155,7 @@ def test_faults_without_effect_are_noted_once_for_each_name():
 @pytest.mark.parametrize(
     ('scenario', 'arguments', 'stopped'),
     [
-        (nothing, {'cases': st.integers(1, 7)}, 'there are no more than 7 different worlds'),
+        (nothing, {'cases': st.integers(1, 40)}, 'there are no more than 40 different worlds'),
         (failing, {'stop_at_first': True}, 'after the first block with a violation'),
         (nothing, {'time_limit': 1e-9}, 'time limit of 1e-09 s'),
     ],
