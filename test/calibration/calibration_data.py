@@ -106,7 +106,31 @@ class Simulation:
         )
 
 
+SHORT = Drive.of(umbmark(side=1.0, runs=1, speed=0.5, turn=2.0))
+"""25 seconds."""
+ROBOT = Simulation(drive=SHORT, rate=25)
 JOINTS = ['left_wheel_joint', 'right_wheel_joint']
+
+
+def deviations(result):
+    """Return the standard deviations of the multipliers."""
+    return np.sqrt(np.diag(result.covariance))
+
+
+def assert_true(result, multipliers=TRUE, most=4.5):
+    """Check that the multipliers are the true ones, within some standard deviations that are small."""
+    assert (deviations(result) < 0.01).all()
+    assert (np.abs(result.multipliers - multipliers) < most * deviations(result)).all()
+
+
+def with_stops(commands, pause=0.6):
+    return [one for command in commands for one in (command, (pause, 0.0, 0.0))]
+
+
+def stepped(readings, steps, random):
+    """Return readings of encoders with some steps per turn, from random angles."""
+    step = 2.0 * np.pi / steps
+    return np.floor(readings / step + random.uniform(0.0, 1.0, 2)) * step
 
 
 def bag_messages(

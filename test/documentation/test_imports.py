@@ -7,7 +7,6 @@ import importlib.util
 import re
 import subprocess
 import sys
-from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -34,42 +33,39 @@ COMMON = {
     **dict.fromkeys(('text', 'time_units', 'errors', 'lazy', 'signals'), ()),
     'bounded_yaml': ('errors', 'text'),
 }
-LOUD = re.compile('print|stdout|stderr')
+LOUD = re.compile(r'\bprint\b|\bstdout\b|\bstderr\b')
 
 
 def place(path) -> str:
-    """Give the layer of a file, or its name if it stands beside them."""
+    """Return the layer of a file, or its name if it stands beside them."""
     first, *rest = path.relative_to(ROOT).parts
     return first if rest else path.stem
 
 
-def statements(node):
-    """Yield the statements in a node of a syntax tree, anywhere in it."""
-    for field in ('body', 'orelse', 'handlers', 'finalbody', 'cases'):
-        for each in getattr(node, field, ()):
-            yield each
-            yield from statements(each)
-
-
-def imports() -> dict[Path, set[str]]:
-    """Collect what each file imports, anywhere in it: `a.b`, and `a.b` and `a` of `from a import b`."""
-    found = defaultdict(set)
-    for path in FILES:
-        package = '.'.join((PACKAGE, *path.parent.relative_to(ROOT).parts))
-        for node in statements(ast.parse(path.read_text(encoding='utf-8'))):
-            if isinstance(node, ast.Import):
-                found[path].update(alias.name for alias in node.names)
-            elif isinstance(node, ast.ImportFrom):
-                module = importlib.util.resolve_name('.' * node.level + (node.module or ''), package)
-                found[path].update({module, *(f'{module}.{alias.name}' for alias in node.names)})
+def imports(path) -> set[str]:
+    """Return what a file imports, anywhere in it: `a.b`, and `a.b` and `a` of `from a import b`."""
+    found = set()
+    package = '.'.join((PACKAGE, *path.parent.relative_to(ROOT).parts))
+    pending = [ast.parse(path.read_text(encoding='utf-8'))]
+    while pending:
+        node = pending.pop()
+        # Statements only.
+        for field in ('body', 'orelse', 'handlers', 'finalbody', 'cases'):
+            pending += getattr(node, field, ())
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = importlib.util.resolve_name('.' * node.level + (node.module or ''), package)
+            found.update({module, *(f'{module}.{alias.name}' for alias in node.names)})
     return found
 
 
 @pytest.mark.slow
 def test_every_module_has_its_place_and_imports_go_down_only():
     assert {place(path) for path in FILES} == {*LAYERS, *COMMON, '__init__'}
-    for path, names in imports().items():
-        here, first = place(path), {name.split('.')[0] for name in names}
+    for path in FILES:
+        names, here = imports(path), place(path)
+        first = {name.split('.')[0] for name in names}
         allowed = {**COMMON, '__init__': ()}.get(here)
         if allowed is None:
             allowed = (*COMMON, *LAYERS[: LAYERS.index(here) + 1])
@@ -86,27 +82,22 @@ def modules(layers) -> list[str]:
     return [str(path).replace('/', '.').removesuffix('.__init__') for path in files]
 
 
-def loaded(modules) -> set[str]:
-    """Import modules in an interpreter of its own; return the top-level names that it has loaded."""
-    program = f'import sys, numpy; before = set(sys.modules); import {", ".join(modules)}\n'
-    program += 'print(*set(sys.modules) - before)'
+@pytest.mark.process
+def test_the_pure_layers_load_nothing_but_numpy_and_reading_and_drawing_nothing_of_ros():
+    """One after the other, in an interpreter of its own."""
+    pure = [*modules(PURE), f'{PACKAGE}.calibration']
+    program = 'import sys, numpy; before = set(sys.modules)\n'
+    for names in (pure, modules(WITHOUT_ROS)):
+        program += f'import {", ".join(names)}\nprint(*set(sys.modules) - before)\n'
     run = subprocess.run(
         [sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60
     )
-    names = set(run.stdout.split())
-    assert {*modules} <= names
-    return {name.split('.')[0] for name in names}
-
-
-@pytest.mark.process
-def test_the_pure_layers_load_nothing_but_numpy():
-    names = loaded([*modules(PURE), f'{PACKAGE}.calibration'])
-    assert names - sys.stdlib_module_names <= {'numpy', PACKAGE}
-
-
-@pytest.mark.process
-def test_reading_and_drawing_load_nothing_of_ros():
-    assert not loaded(modules(WITHOUT_ROS)) & {*ROS_MODULES, 'rpyutils', 'matplotlib', 'rich'}
+    first, both = (set(line.split()) for line in run.stdout.splitlines())
+    assert first.issuperset(pure)
+    assert both.issuperset(modules(WITHOUT_ROS))
+    loaded, more = ({name.split('.')[0] for name in names} for names in (first, both))
+    assert loaded - sys.stdlib_module_names <= {'numpy', PACKAGE}
+    assert not more & {*ROS_MODULES, 'rpyutils', 'matplotlib', 'rich'}
 
 
 def test_only_the_tools_print():

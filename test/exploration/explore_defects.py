@@ -2,7 +2,6 @@
 
     python test/exploration/explore_defects.py  all of them, up to 1,000 worlds each
     python test/exploration/explore_defects.py --worlds 100 'no defect' some of them
-    python test/exploration/explore_defects.py --page doc/exploration.md  write the table into a page
 
 All controllers are tried in the same worlds and against the same properties. An
 exploration stops at the first block of 50 worlds with a violation. The right controller runs in all
@@ -12,12 +11,8 @@ worlds. Exit code 1: a defect was not found, or the right controller violates so
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 import time
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from defective_controllers import CONTROLLERS, DEFECTIVE, LAST_EVENT, PROPERTIES, drive
 from hypothesis import strategies as st
@@ -37,7 +32,6 @@ HEAD = (
     '| defect | found | worlds | by | smallest case | worlds to shrink | s |',
     '|---|---|---|---|---|---|---|',
 )
-TABLE = re.compile(r'(<!-- table: defects -->\n).*?(<!-- end -->)', re.DOTALL)
 
 
 def schedules():
@@ -113,38 +107,24 @@ def row(name, exploration, finding, seconds):
     )
 
 
-def arguments():
+def main():
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
     parser.add_argument('names', nargs='*', metavar='NAME', help='defects (default: all, and none)')
     parser.add_argument('--worlds', type=int, default=1000, help='worlds of each (default: 1000)')
     parser.add_argument('--seed', type=int, default=0, help='seed of everything random (default: 0)')
-    parser.add_argument('--page', type=Path, help='page into which the table is written')
     chosen = parser.parse_args()
     if unknown := sorted(set(chosen.names) - set(CONTROLLERS)):
         parser.error(f'unknown defect {unknown[0]!r}; known: {", ".join(CONTROLLERS)}')
-    if chosen.page is not None and not TABLE.search(chosen.page.read_text(encoding='utf-8')):
-        parser.error(f'{chosen.page} has no <!-- table: defects --> ... <!-- end -->')
-    return chosen
-
-
-def main():
-    chosen = arguments()
-    lines, failed = list(HEAD), []
+    failed = False
     print('\n'.join(HEAD))
     for name in chosen.names or CONTROLLERS:
         begin = time.monotonic()
         exploration, finding = explored(name, chosen.worlds, chosen.seed)
-        lines.append(row(name, exploration, finding, time.monotonic() - begin))
-        print(lines[-1], flush=True)
+        print(row(name, exploration, finding, time.monotonic() - begin), flush=True)
         if bool(exploration.findings) != (name in DEFECTIVE):
-            failed.append(name)
+            failed = True
             print(exploration, file=sys.stderr)
-    if chosen.page is not None:
-        table = '\n'.join(lines)
-        page = chosen.page.read_text(encoding='utf-8')
-        page = TABLE.sub(lambda match: f'{match[1]}{table}\n{match[2]}', page)
-        chosen.page.write_text(page, encoding='utf-8')
-    return 1 if failed else 0
+    return int(failed)
 
 
 if __name__ == '__main__':

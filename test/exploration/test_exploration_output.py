@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import ast
+import json
 import re
 import shutil
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import pytest
-from exploration_scenarios import Follower, Sensor, failing, follow, robot, serial
+from exploration_scenarios import Follower, Sensor, failing, moving, robot, serial
 from hypothesis import strategies as st
 
+from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.exploration.exploring import result_of
 from diffdrive_jacobian.exploration.output import remove_others, write_finding
 from diffdrive_jacobian.exploration.processes import _picklable
-from diffdrive_jacobian.faults import Hang, Loss
+from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.plots.run_figure import VIOLATION
 from diffdrive_jacobian.properties import NeverFasterThan, Property, StaysNear, Watch
@@ -23,21 +26,12 @@ from diffdrive_jacobian.testing import (
     Lockstep,
     PropertyViolation,
     SerialExecutor,
-    fault_schedules,
 )
 
 
 def explored(output, case=70):
     """Explore one world in which a scenario fails, if the case is large."""
     return serial(failing, cases=st.just(case), worlds=1, output=output).findings
-
-
-def contents(folder):
-    """Return all files and folders with what is in them."""
-    return {
-        path: path.readlink() if path.is_symlink() else path.is_dir() or path.read_bytes()
-        for path in folder.rglob('*')
-    }
 
 
 class Interrupting(SerialExecutor):
@@ -56,15 +50,13 @@ def written(tmp_path_factory):
     return explored(tmp_path_factory.mktemp('written'))[0]
 
 
-def test_what_was_not_found_again_is_removed(tmp_path, written):
-    """Only what an exploration has written, not what the user has added, renamed or copied."""
+def test_another_exploration_replaces_what_was_written_and_nothing_else(tmp_path, written):
+    """Not what the user has added, renamed or copied."""
     output = tmp_path / 'found'
     folder = output / written.directory.name
     for copied in (folder, output / 'kept', output / 'CopiedTest'):
         shutil.copytree(written.directory, copied)
     (output / 'CopiedTest' / 'test_copied_test.py').write_text('own = 1\n')
-    (output / 'other' / 'run').mkdir(parents=True)
-    (output / 'other' / 'test_other.py').write_text('own = 1\n')
     compiled = folder / '__pycache__' / 'test_no_exception_assertion_error.cpython-312.pyc'
     compiled.parent.mkdir()
     compiled.touch()
@@ -73,9 +65,24 @@ def test_what_was_not_found_again_is_removed(tmp_path, written):
     assert folder.exists()
     assert explored(output, 1) == ()
     assert set(output.rglob('*')) == before
-    (explored(output)[0].directory / 'notes.txt').write_text('mine')
+    explored(output)
+    (folder / 'notes.txt').write_text('mine')
+    explored(output, 80)
+    assert json.loads((folder / 'counterexample.json').read_text())['case'] == '80'
     explored(output, 1)
     assert [path.name for path in folder.iterdir()] == ['notes.txt']
+
+
+def test_files_of_others_stay(tmp_path, monkeypatch):
+    """Those in a folder of the same name. A relative output stays where it was, too."""
+    precious = tmp_path / 'found' / 'NoExceptionValueError' / 'run' / 'precious'
+    precious.parent.mkdir(parents=True)
+    precious.touch()
+    monkeypatch.chdir(tmp_path)
+    found = serial(moving, worlds=1, output='found')
+    assert precious.exists()
+    assert found.findings[0].directory == tmp_path / 'found' / 'NoExceptionValueError_2'
+    assert (found.findings[0].directory / 'run').is_dir()
 
 
 TEST = 'test_no_exception_assertion_error.py'
@@ -97,8 +104,6 @@ def replace_by_link(path, own):
 
 IN_THE_WAY = {
     'a case of somebody else': lambda folder, own: lay(folder, 'counterexample.json', '{}'),
-    'a bag': lambda folder, own: lay(folder, 'run/data'),
-    'a note': lambda folder, own: lay(folder, 'notes'),
     'a file': lambda folder, own: folder.write_text('1'),
     'a link to a folder': lambda folder, own: (own.mkdir(), folder.symlink_to(own)),
     'a link to nothing': lambda folder, own: folder.symlink_to(own),
@@ -120,6 +125,14 @@ CHANGED = {
 """What a user has done with a folder that was written."""
 
 
+def contents(folder):
+    """Return all files and folders with what is in them."""
+    return {
+        path: path.readlink() if path.is_symlink() else path.is_dir() or path.read_bytes()
+        for path in folder.rglob('*')
+    }
+
+
 @pytest.mark.parametrize('what', [*IN_THE_WAY, *CHANGED])
 def test_what_somebody_else_has_written_or_changed_stays(tmp_path, written, what):
     """With the rest of its folder: a changed test needs the case."""
@@ -138,7 +151,7 @@ def test_what_somebody_else_has_written_or_changed_stays(tmp_path, written, what
     assert contents(tmp_path) == before
 
 
-# --- Texts
+# --- Files and texts
 
 
 def unfinished(world, case):
@@ -148,7 +161,7 @@ def unfinished(world, case):
     world.run_until(lambda: False, timeout=0.3, what='the last corner')
 
 
-def test_an_exception_is_described_by_its_first_line(tmp_path):
+def test_a_case_a_bag_and_a_test_are_written_and_an_exception_is_described_by_its_first_line(tmp_path):
     """Not by the last line of the report that follows it."""
     loss = Loss('speed', start=0.1, duration=0.1)
     (finding,) = serial(unfinished, faults=st.just([loss]), worlds=1, output=tmp_path).findings
@@ -158,8 +171,28 @@ def test_an_exception_is_described_by_its_first_line(tmp_path):
         r'LockstepError in test_exploration_output.py:\d+ \(unfinished\)', finding.violation.key
     )
     assert f'\n  failed at 0.3 s: {expected}\n' in str(finding)
-    source = next(finding.directory.glob('test_*.py')).read_text()
+    folder = finding.directory
+    assert folder.name == 'NoExceptionLockstepError'
+    case = json.loads((folder / 'counterexample.json').read_text())
+    assert case['faults'] == ["Loss('speed', start=0.1, duration=0.1)"]
+    assert case['digest'] == finding.digest
+    assert case['versions']['python']
+    with open_bag(folder / 'run') as bag:
+        assert {'/speed', '/cmd_vel', '/fault_events'} <= {one.topic for one in bag.connections}
+    # There is no odometry.
+    assert 'no picture' in finding.notes[0]
+    source = (folder / 'test_no_exception_lockstep_error.py').read_text()
     assert source.startswith(f'"""{finding.violation.key}, at 0.3 s.\n\n{expected}\n\n')
+    # What the test imports, it uses.
+    tree = ast.parse(source)
+    imported = [
+        name.asname or name.name
+        for node in ast.walk(tree)
+        if isinstance(node, (ast.Import, ast.ImportFrom)) and node.module != '__future__'
+        for name in node.names
+    ]
+    used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    assert used.issuperset(imported)
 
 
 class SilentError(Exception):
@@ -245,16 +278,3 @@ def test_a_long_property_is_cut_and_the_picture_marks_when_it_is_violated(tmp_pa
     assert [text.get_text() for text in legend.get_texts()] == [f'violated: {fast!r}']
     (mark,) = (line for line in drawing.axes[1].lines if line.get_color() == VIOLATION)
     assert mark.get_xdata()[0] == pytest.approx(short.violation.seconds, abs=0.05)
-
-
-def test_faults_without_effect_are_noted_once_for_each_name():
-    schedules = fault_schedules(['typo'], ['follwer'], kinds=[Loss, Hang], max_faults=2, duration=1.0)
-    found = serial(follow, faults=schedules, worlds=8)
-    notes = re.findall(r'^note: (.*) \(\d+ of 8 worlds\)$', str(found), re.MULTILINE)
-    assert sorted(notes) == [
-        'a fault had no effect: no node /follwer was seen',
-        'a fault had no effect: no subscription of /typo was seen',
-    ]
-    text = str(replace(found, notes=tuple(f'note {number}' for number in range(14))))
-    assert text.count('\nnote: ') == 11
-    assert 'note: and 4 more notes' in text

@@ -32,8 +32,8 @@ from diffdrive_jacobian.testing import (
     waypoints,
 )
 
-FEW = settings(max_examples=40, database=None, derandomize=True, deadline=None)
-SHRINK = settings(max_examples=100, database=None, derandomize=True)
+FEW = settings(max_examples=25, database=None, derandomize=True, deadline=None)
+SHRINK = settings(max_examples=60, database=None, derandomize=True)
 FIELDS = {'odom': ['pose.pose.position.x', 'header.stamp', 'header.frame_id']}
 
 
@@ -60,8 +60,6 @@ def test_values_are_on_their_grids(number, time, pose, goal, route, gain, probab
 
 def test_values_shrink_to_round_ones():
     for strategy, condition, smallest in (
-        (numbers(-5.0, 5.0), lambda x: True, 0.0),
-        (numbers(-5.0, 5.0), lambda x: x > 2.6, 3.0),
         (numbers(-5.0, 5.0), lambda x: x < -2.6, -3.0),
         (numbers(0.0, 10.0), lambda x: 2.3 <= x <= 2.7, 2.5),
         (numbers(2.0, 8.0), lambda x: True, 2.0),
@@ -118,8 +116,6 @@ def test_a_schedule_shrinks_to_one_round_fault():
         [faults.Loss('cmd_vel', start=4.0, duration=1.0)],
         [faults.Loss('cmd_vel', duration=5.0)],
     )
-    any_two = find(strategy, lambda schedule: len(schedule) == 2, settings=SHRINK)
-    assert any_two == [faults.Loss('cmd_vel', duration=0.1)] * 2
 
 
 @FEW
@@ -155,37 +151,33 @@ def test_kinds_are_those_that_are_asked_for_also_of_ones_own_and_endless():
 
 # --- Generation
 
-
 SMALL = trials(st.fixed_dictionaries({'x': st.integers()}), fault_schedules(['odom']))
 
 
-def test_a_block_depends_on_its_seed_and_number_alone(tmp_path, monkeypatch):
+def test_a_block_depends_on_its_seed_and_number_alone_also_while_shrinking(tmp_path, monkeypatch):
     before = generate(SMALL, 1, 2, 50)
     assert len(before) == 50
     # Hypothesis would try the constants of a module that is loaded meanwhile.
     (tmp_path / 'constants.py').write_text(f'NUMBERS = {list(range(70_000, 70_900))}\n')
     monkeypatch.syspath_prepend(tmp_path)
     importlib.import_module('constants')
-    try:
-        assert generate(SMALL, 1, 2, 50) == before
-    finally:
-        del sys.modules['constants']
-    assert generate(SMALL, 1, 3, 50) != before
-    assert generate(SMALL, 2, 2, 50) != before
+    tried = []
 
-
-def test_a_block_is_generated_again_while_shrinking():
     def fails(trial):
         tried.append(trial)
         return trial.case['x'] > 1000
 
-    tried = []
-    generated = generate(SMALL, 0, 1, 50)
-    first = next(index for index, trial in enumerate(generated) if trial.case['x'] > 1000)
-    assert shrink(SMALL, 0, 1, 50, fails) == Trial(case={'x': 1001})
-    assert tried[: first + 1] == generated[: first + 1]
+    try:
+        smallest = shrink(SMALL, 1, 2, 50, fails)
+    finally:
+        del sys.modules['constants']
+    first = next(index for index, trial in enumerate(before) if trial.case['x'] > 1000)
+    assert tried[: first + 1] == before[: first + 1]
+    assert smallest == Trial(case={'x': 1001})
+    assert generate(SMALL, 1, 3, 5) != before[:5]
+    assert generate(SMALL, 2, 2, 5) != before[:5]
     with pytest.raises(ExplorationError, match='no trial'):
-        shrink(SMALL, 0, 1, 50, lambda trial: False)
+        shrink(SMALL, 0, 1, 5, lambda trial: False)
 
 
 def test_hypothesis_that_is_missing_is_named(monkeypatch):
