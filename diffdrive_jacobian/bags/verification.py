@@ -315,7 +315,8 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
         changed = [None] * len(series) if is_start else models
         rows = zip(series.received.tolist(), series.stamps.tolist(), changed, values, strict=True)
         events += list(rows)[begin:]
-    events.sort(key=lambda event: event[0])
+    # A placement comes after the timeout that it noticed, which took effect before.
+    events.sort(key=lambda event: event[:2])
     model = first_model
     # The command that was recorded before the odometry is in effect in its first message.
     driven = (run.cmd_vel_out.stamps <= first.stamp) & (

@@ -148,13 +148,18 @@ def test_placements_resets_timeouts_and_parameters_are_driven_again(lockstep, ro
         lockstep.run_for(0.1)
         lockstep.publish('initialpose', placed)
         lockstep.run_for(0.3)
+        lockstep.publish('cmd_vel', twist(0.3, -1.0))
+        # The placement notices the timeout, which took effect since the last odometry.
+        lockstep.run_for(0.155)
+        lockstep.publish('initialpose', placed)
+        lockstep.run_for(0.045)
         lockstep.publish('cmd_vel', twist(1.0, 0.1))
         change(robot, linear__x__max_velocity=0.2)
         lockstep.run_for(0.1)
         lockstep.call(Trigger, 'reset_odometry')
         lockstep.run_for(0.3)
     run = made.run
-    assert len(run.start_pose) == 3
+    assert len(run.start_pose) == 4
     assert run.parameter_events[-1][2] == {'linear.x.max_velocity': 0.2}
     held(run)
 
