@@ -104,6 +104,18 @@ def test_odd_names_are_refused_quoted_in_short_and_without_control_characters(
 MALFORMED_HASHES = ('', 'y' * 100_000, f'RIHS01_{"0" * 63}g', f'RIHS01_{"0" * 64}\n')
 
 
+def test_exception_of_our_own_callbacks_is_not_caught(lockstep, add_complete):
+    node = add_complete(GoToGoal)
+
+    def fail(_):
+        raise ZeroDivisionError('of the node itself')
+
+    node.add_post_set_parameters_callback(fail)
+    request = SetParameters.Request(parameters=[of_type('kp', 10), double('kp', 2.5)])
+    with pytest.raises(ZeroDivisionError, match='of the node itself'):
+        lockstep.call(SetParameters, 'go_to_goal/set_parameters', request)
+
+
 def test_malformed_type_hash_is_refused_and_not_logged_and_others_are_described(ros, capfd):
     with running(ros.context, isolated=False) as runner:
         node = runner.add(lambda: GoalClient('client', np.zeros((1, 3)), ros.context))

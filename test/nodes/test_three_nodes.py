@@ -137,3 +137,16 @@ def test_when_a_node_is_removed_the_others_stop_within_the_timeout(lockstep, tea
     assert at_rest(team.odom[-1])
     # The controller without its bridge goes on to command.
     assert removed == 'controller' or team.commands[-1] != Twist()
+
+
+@pytest.mark.lockstep(start=100.0)
+@pytest.mark.parametrize('seconds', [-90.0, 0.05])
+def test_time_jumps_while_driving_and_the_robot_arrives(lockstep, team, seconds):
+    lockstep.publish('goal_pose', goal(1.0, 1.0))
+    lockstep.run_for(0.3)
+    lockstep.jump(seconds)
+    lockstep.run_for(0.05)
+    assert len(team.starts) == (2 if seconds < 0.0 else 1)
+    arrives(lockstep, team)
+    assert team.statuses == [ACCEPTED, EXECUTING, SUCCEEDED]
+    assert pose_of(team.odom[-1])[:2] == pytest.approx((1.0, 1.0), abs=0.02)
