@@ -267,3 +267,9 @@ def test_what_is_invalid_is_named(argument, named, values):
     for bad in values:
         with pytest.raises(ValueError, match=rf'\b{named}0?\b.*must.*got'):
             track_line(**{'robot': ROBOT, 'q0': Q0, 'line': several, argument: bad})
+
+
+def test_a_line_without_length_is_over_at_once():
+    gone = track_line(ARM, [0.2, 1.0], StraightLine([1.0, 1.0], [1.0, 1.0], 1.0))
+    assert (gone.times.shape, gone.q.shape, gone.error.shape) == ((1,), (1, 2), (1,))
+    assert gone.q_dot.shape == (0, 2)

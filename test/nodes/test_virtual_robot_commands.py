@@ -27,6 +27,7 @@ from support.ros_messages import (
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.messages.codecs import POSE_WITH_COVARIANCE
+from diffdrive_jacobian.messages.conversion import from_covariance
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 
 BEGIN = 100 * SECOND
@@ -257,3 +258,14 @@ def test_a_rounded_covariance_does_not_grow_into_a_negative_variance(lockstep, a
     lockstep.run_for(0.1)
     assert len(topics.starts) == 2
     assert min(np.diag(covariance_of(topics.odom[-1]))) >= 0.0
+
+
+def test_variances_that_rounding_made_negative_are_set_to_zero():
+    message, direction = placement(7.0), np.array([0.6, 0.0, 0.8])
+    exact = np.outer(direction, direction)
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_((0, 1, 5), (0, 1, 5))] = exact - 1e-12 * np.eye(3)
+    message.pose.covariance = covariance.ravel()
+    found = from_covariance(value_of(POSE_WITH_COVARIANCE, message).covariance)
+    np.testing.assert_allclose(found, exact, atol=1e-11)
+    assert np.linalg.eigvalsh(found)[0] > -1e-15
