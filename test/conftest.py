@@ -45,8 +45,8 @@ CHUNK = 4
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers():
-    """Start one worker more than there are cores for `-n auto`: many tests wait for processes."""
-    return len(os.sched_getaffinity(0)) + 1
+    """Start two workers more than there are cores for `-n auto`: many tests wait for processes."""
+    return len(os.sched_getaffinity(0)) + 2
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -66,12 +66,13 @@ def pytest_configure(config):
 def pytest_collection():
     """Collect the tests without garbage collection, which afterwards leaves them alone.
 
-    They are a million objects that stay until the end.
+    They are a million objects that stay until the end. What the tests leave is collected less often.
     """
     gc.disable()
     yield
     gc.freeze()
     gc.enable()
+    gc.set_threshold(20_000, 50, 100)
 
 
 @pytest.hookimpl(trylast=True)

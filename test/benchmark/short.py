@@ -19,6 +19,7 @@ COMMANDS = (
     ('bags.py', '--seconds', '1'),
     ('calibration_cases.py', '--robots', '1', 'UMBmark'),
     ('crash.py', '1'),
+    ('explore_defects.py', '--worlds', '50', 'divides by distance'),
     ('drift.py', '--seeds', '20', '--rounds', '1', '--limited'),
     ('inverse_kinematics.py', '--quick'),
     ('limiter.py',),

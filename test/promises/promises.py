@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 TEST = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(TEST), str(TEST / 'exploration'), str(TEST / 'benchmark')]
+sys.path[:0] = [str(TEST), str(TEST / 'benchmark')]
 
 from process_faults.outcome import Outcome, spread  # noqa: E402
 

@@ -1,7 +1,7 @@
-"""How many of twelve defects `explore` finds: the controllers of `defective_controllers.py`.
+"""How many defects `explore` finds: those of `test/exploration/defective_controllers.py`.
 
-    python test/exploration/explore_defects.py  all of them, up to 1,000 worlds each
-    python test/exploration/explore_defects.py --worlds 100 'no defect' some of them
+    python test/benchmark/explore_defects.py  all of them, up to 1,000 worlds each
+    python test/benchmark/explore_defects.py --worlds 100 'no defect' some of them
 
 All controllers are tried in the same worlds and against the same properties. An
 exploration stops at the first block of 50 worlds with a violation. The right controller runs in all
@@ -13,9 +13,19 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from pathlib import Path
 
-from defective_controllers import CONTROLLERS, DEFECTIVE, LAST_EVENT, PROPERTIES, drive
 from hypothesis import strategies as st
+
+sys.path.insert(0, str(Path(__file__).parents[1] / 'exploration'))
+
+from defective_controllers import (
+    CONTROLLERS,
+    DEFECTIVE,
+    LAST_EVENT,
+    PROPERTIES,
+    drive,
+)
 
 from diffdrive_jacobian import faults
 from diffdrive_jacobian.testing import explore, fault_schedules, numbers, points, poses
