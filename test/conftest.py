@@ -113,6 +113,15 @@ def forked_python(tmp_path_factory):
 
 
 @pytest.fixture
+def world(tmp_path_factory):
+    """Processes of the commands, in a ROS domain of their own, see `processes.World`."""
+    from support.processes import open_world
+
+    with open_world(tmp_path_factory.mktemp('world')) as made:
+        yield made
+
+
+@pytest.fixture
 def quick_disk(monkeypatch):
     """Wait for no disk: the files of a test need not survive a power cut."""
     monkeypatch.setattr(os, 'fsync', lambda descriptor: None)

@@ -12,7 +12,6 @@ import pytest
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
-from support.processes import open_world
 from support.raw_bags import read_bag, read_journal, recover
 
 from diffdrive_jacobian.bags.files import journal_of
@@ -28,13 +27,6 @@ ALLOWED_LOSS = 1.0
 """Of a killed recorder (s)."""
 NOTHING_TO_DO = 3
 """Exit code of recover_run where nothing is missing, as far as SQLite shows."""
-
-
-@pytest.fixture
-def world(tmp_path):
-    (tmp_path / 'world').mkdir()
-    with open_world(tmp_path / 'world') as made:
-        yield made
 
 
 # --- Killed

@@ -11,19 +11,12 @@ from types import SimpleNamespace
 
 import pytest
 from chromium import until
-from support.processes import open_world
 from websockets.sync.client import connect
 
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import drive_to, watch_run
 
 QUICK = ('--ros-args', '-p', 'go_to_goal:kp:=8.0', '-p', 'go_to_goal:kv:=4.0')
-
-
-@pytest.fixture
-def world(tmp_path):
-    with open_world(tmp_path) as made:
-        yield made
 
 
 def opened(child):

@@ -8,7 +8,6 @@ import pytest
 from fork_server import forked
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
-from support.processes import open_world
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -30,12 +29,6 @@ data = serialize_message(twist)
 while True:
     publisher.publish(data)
 """
-
-
-@pytest.fixture
-def world(tmp_path):
-    with open_world(tmp_path) as world:
-        yield world
 
 
 @pytest.mark.process

@@ -19,7 +19,6 @@ from ruamel.yaml import YAML
 from std_msgs.msg import String
 from support.commands import interrupted, run
 from support.harness import PATIENCE
-from support.processes import open_world
 from support.raw_bags import read_journal
 from support.ros_messages import twist
 
@@ -32,12 +31,6 @@ from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import record_run
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-@pytest.fixture
-def world(tmp_path):
-    with open_world(tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

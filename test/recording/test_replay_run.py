@@ -16,7 +16,6 @@ from support.bags import REAL as FOREIGN
 from support.bags import count_more
 from support.commands import interrupted, refused, run
 from support.lockstep_nodes import make_complete
-from support.processes import open_world
 from support.recorded import recorded
 from support.ros_messages import goal, goals, twists
 
@@ -60,12 +59,6 @@ def bag(recorded_run):
 def commands(recorded_run):
     """The commands of the run."""
     return [tuple(one) for one in recorded_run.cmd_vel.values.tolist()]
-
-
-@pytest.fixture
-def world(tmp_path):
-    with open_world(tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

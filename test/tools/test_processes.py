@@ -9,7 +9,7 @@ import signal
 import time
 
 import pytest
-from support.processes import Drive, open_world
+from support.processes import Drive
 
 pytestmark = pytest.mark.process
 
@@ -17,12 +17,6 @@ NODES = ('virtual_robot', 'go_to_goal', 'wheel_bridge')
 FAST = ('--ros-args', '-p', 'kp:=8.0', '-p', 'kv:=4.0')
 HIDDEN = (*FAST, '-r', '__ns:=/hidden')
 FAR = ('50', '0')
-
-
-@pytest.fixture
-def world(tmp_path):
-    with open_world(tmp_path) as made:
-        yield made
 
 
 def interrupt(children, *numbers):
