@@ -19,14 +19,13 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-TEST = Path(__file__).parents[1]
-sys.path[:0] = [str(TEST), str(TEST / 'bags')]
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from support.processes import open_world  # noqa: E402
-from test_recover_crash import ALLOWED_LOSS, STORAGES, Control, crash  # noqa: E402
+from support.crashes import ALLOWED_LOSS, STORAGES, Control, crash
+from support.processes import open_world
 
-from diffdrive_jacobian.signals import Signals  # noqa: E402
-from diffdrive_jacobian.tools.recover_run import main as recover_run  # noqa: E402
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools.recover_run import main as recover_run
 
 A_WORLD = 4
 """Runs for each start of a robot, which may live for half a minute only."""

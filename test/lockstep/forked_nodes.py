@@ -15,6 +15,7 @@ from unittest import mock
 
 import external_nodes
 from fork_server import forked
+from std_msgs.msg import Float64
 
 from diffdrive_jacobian.lockstep.external import process
 
@@ -74,3 +75,14 @@ def started_in_forks():
     replaced = SimpleNamespace(Popen=start, PIPE=subprocess.PIPE)
     with mock.patch.object(process, 'subprocess', replaced):
         yield
+
+
+def command(*names):
+    """Return the command that starts a process with some nodes of `external_nodes`."""
+    return [sys.executable, external_nodes.__file__, *names]
+
+
+def send(world, name, *values):
+    """Publish numbers on the input of a node of `external_nodes`."""
+    for value in values:
+        world.publish(f'{name}/in', Float64(data=float(value)))

@@ -9,10 +9,9 @@ import sys
 from collections import Counter
 from contextlib import contextmanager
 
-import external_nodes
 import pytest
 from external_nodes import Stage
-from forked_nodes import started_in_forks
+from forked_nodes import command, send, started_in_forks
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterType
@@ -44,22 +43,12 @@ def forks():
         yield
 
 
-def command(*names):
-    """Return the command that starts a process with some nodes of `external_nodes`."""
-    return [sys.executable, external_nodes.__file__, *names]
-
-
 def stamp(message):
     return message.stamp.sec * SECOND + message.stamp.nanosec
 
 
 def numbers(messages):
     return [float(one.frame_id) for one in messages]
-
-
-def send(world, name, *values):
-    for value in values:
-        world.publish(f'{name}/in', Float64(data=float(value)))
 
 
 @contextmanager

@@ -10,12 +10,11 @@ import time
 from pathlib import Path
 
 import pytest
-from forked_nodes import started_in_forks
+from forked_nodes import command, send, started_in_forks
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
-from test_external import command, send
 
 from diffdrive_jacobian.lockstep.external import datagrams, node_process
 from diffdrive_jacobian.lockstep.external import process as external_process
