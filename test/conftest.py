@@ -37,6 +37,18 @@ LONGEST_FIRST = (
     *('test_faults_same', 'test_faulty_drives'),
 )
 """Files with tests that take seconds. They start first, so that none is left for the end."""
+SLOW = {
+    *('test_calibrate_run', 'test_calibration', 'test_cdr', 'test_closed_loop'),
+    *('test_damage_fuzz', 'test_defective_controllers', 'test_drives', 'test_exploration'),
+    *('test_exploration_output', 'test_exploration_strategies', 'test_explored_nodes'),
+    *('test_faulty_drives', 'test_fixtures', 'test_go_to_goal_paths', 'test_golden_run'),
+    *('test_ground_truth', 'test_hostile_bags', 'test_live_node', 'test_lockstep_failures'),
+    *('test_options', 'test_own_controllers', 'test_own_gains', 'test_paths_driven'),
+    *('test_plot_run', 'test_properties_nodes', 'test_recover', 'test_replay_run'),
+    *('test_sweep_gains', 'test_three_nodes', 'test_timeline', 'test_verification'),
+    *('test_virtual_robot', 'test_virtual_robot_commands'),
+}
+"""Files whose tests take more than a second of CPU time together: they are marked as slow."""
 MEMORY = 700 << 20
 """What a test with `bounded_memory` may take (bytes)."""
 CHUNK = 4
@@ -73,6 +85,12 @@ def pytest_collection():
     gc.freeze()
     gc.enable()
     gc.set_threshold(20_000, 50, 100)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_itemcollected(item):
+    if item.path.stem in SLOW:
+        item.add_marker('slow')
 
 
 @pytest.hookimpl(trylast=True)

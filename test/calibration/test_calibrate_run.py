@@ -101,7 +101,6 @@ def left(folder):
 # --- Result
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures('no_display')
 def test_it_writes_parameters_and_a_picture(bag, folder, lockstep):
     for name in ('found.yaml', 'found.png'):
@@ -154,7 +153,6 @@ def test_the_picture_shows_both_paths_and_the_errors():
     assert 'mm' in residual.get_ylabel()
 
 
-@pytest.mark.slow
 def test_a_robot_of_this_package_is_calibrated_with_its_bag(lockstep, folder):
     """One with wrong wheels that slip. doc/calibration.md drives it again as calibrated."""
     wrong = {f'true_{name}': value for name, value in zip(PARAMETERS, TRUE, strict=True)}

@@ -162,7 +162,6 @@ def test_umbmark_recovers_the_true_multipliers_and_the_noise():
     assert result.estimate.noise.heading == pytest.approx(NOISE.heading, rel=0.15)
 
 
-@pytest.mark.slow
 def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance():
     """A small form of `benchmark/calibration_cases.py`: mean squares of 8 robots."""
     errors, nees, bounds, places = [], [], [], []
@@ -341,7 +340,6 @@ def test_wheels_are_located_between_the_steps_of_their_encoders():
     assert error[deviation == 0.0].std() < 0.5 * deviation.max()
 
 
-@pytest.mark.slow
 def test_few_steps_make_the_multipliers_uncertain_and_not_wrong():
     random = np.random.default_rng(21)
     drive = Drive.of(with_stops(umbmark(side=1.0, runs=1, speed=0.4, turn=2.0)))

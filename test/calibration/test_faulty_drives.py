@@ -144,7 +144,6 @@ def test_wheels_that_may_be_swapped_and_negated_are_noted():
     assert calibrate([turned], NOMINAL, Given(yaw_offset=np.pi)).notes == ()
 
 
-@pytest.mark.slow
 def test_wheels_at_a_low_rate_and_slip_are_noted():
     recording = replace(ROBOT, drive=SLOW).recording(np.random.default_rng(13))
     rare = replace(

@@ -31,6 +31,8 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.properties import NeverFasterThan
 from diffdrive_jacobian.testing import Lockstep, LockstepError, PropertyViolation, check_repeats
 
+pytestmark = pytest.mark.process
+
 SECOND = 1_000_000_000
 GO_TO_GOAL = [sys.executable, '-c', PROGRAM.format('go_to_goal')]
 QUICK = ['--ros-args', '-p', 'kp:=24.0', '-p', 'kv:=12.0']

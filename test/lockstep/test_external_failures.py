@@ -22,6 +22,8 @@ from diffdrive_jacobian.lockstep.external import quiet as quietness
 from diffdrive_jacobian.lockstep.external.process import ExternalProcess
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
+pytestmark = pytest.mark.process
+
 
 @pytest.fixture(autouse=True, scope='module')
 def forks():

@@ -171,7 +171,6 @@ WORLDS = """
 """
 
 
-@pytest.mark.slow
 def test_each_test_has_a_world_and_robots_of_its_own(run):
     text = run(WORLDS, '--capture=no', passed=4, failed=1, errors=1)
     assert 'TypeError: the marker lockstep takes keyword arguments only' in text
@@ -294,7 +293,6 @@ FAILURES = """
 """
 
 
-@pytest.mark.slow
 def test_a_failure_reports_the_last_messages_once_and_required_properties_are_checked(run):
     # Without the summary, which repeats whole messages where the variable CI is set.
     text = run(FAILURES, '-rN', failed=5, passed=3, errors=1)
@@ -348,7 +346,6 @@ BROKEN = """
 """
 
 
-@pytest.mark.slow
 def test_what_fails_while_a_failure_is_reported_is_reported_and_the_session_goes_on(run):
     text = run(BROKEN, failed=3, passed=1)
     assert text.count("not available: KeyError: 'of a bug'") == 2
@@ -390,7 +387,6 @@ RECORDED = """
 """
 
 
-@pytest.mark.slow
 def test_run_of_a_failed_test_is_kept_and_of_others_is_not(pytester):
     result = run_inner(pytester, RECORDED, '--basetemp=kept')
     result.assert_outcomes(failed=2, passed=2)

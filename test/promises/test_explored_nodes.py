@@ -9,7 +9,6 @@ from diffdrive_jacobian import faults
 from diffdrive_jacobian.exploration.trial import MessageDigest
 from diffdrive_jacobian.testing import Lockstep, SerialExecutor, explore
 
-pytestmark = pytest.mark.slow
 WORLDS = 2
 
 
