@@ -149,7 +149,7 @@ def test_wheels_at_a_low_rate_and_slip_are_noted():
     rare = replace(
         recording, wheel_time=recording.wheel_time[::50], wheel_angles=recording.wheel_angles[::50]
     )
-    assert any('every 1 s' in note for note in calibrate([rare], NOMINAL).notes)
+    assert any('every 1 s, so that' in note for note in calibrate([rare], NOMINAL).notes)
     slips = replace(ROBOT, noise=replace(NOISE, wheel=2e-3)).recording(np.random.default_rng(13))
     assert any('m after 1 m: they slip' in note for note in calibrate([slips], NOMINAL).notes)
 
