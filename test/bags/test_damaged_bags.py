@@ -82,7 +82,7 @@ def edit(bag, *keys_and_value):
 INVALID = {
     'version': [ABSENT, None, 'nine', 0, 10, 9.0, True],
     'storage_identifier': [ABSENT, None, 'rosbag', ['mcap']],
-    'relative_file_paths': [ABSENT, 3, 'x', [None], [''], {'a': 'b'}, ['a', 'a'], ['a', 'b/a']],
+    'relative_file_paths': [ABSENT, 3, 'x', [None], [''], ['a\0'], {'a': 'b'}, ['a', 'a'], ['a', 'b/a']],
     'duration': [ABSENT, 3, {}, *({'nanoseconds': one} for one in (-1, 2**63))],
     'starting_time': [ABSENT, 'x', {'nanoseconds_since_epoch': None}],
     'message_count': [ABSENT, -1, 1.5, 2**63],

@@ -270,6 +270,7 @@ INVALID_CONTROLLERS = [
 INVALID_GAINS = [
     ({'name': 'K'}, 'name of a gain must be a lower-case letter'),
     ({'name': 'lambda'}, "got 'lambda'"),
+    ({'unit': 3}, 'unit must be'),
     ({'default': 5.0}, 'ki must be in [-1, 2], got 5'),
     ({'above': 1.0}, 'ki must be in (1, 2], got 1'),
     ({'bounds': (1.0,)}, 'bounds must have shape (..., 2)'),
