@@ -48,7 +48,7 @@ SLOW = {
     *('test_sweep_gains', 'test_three_nodes', 'test_timeline', 'test_verification'),
     *('test_virtual_robot', 'test_virtual_robot_commands'),
 }
-"""Files whose tests take more than a second of CPU time together: they are marked as slow."""
+"""Files that are marked as slow as a whole: their tests take more than a second of CPU time together."""
 MEMORY = 700 << 20
 """What a test with `bounded_memory` may take (bytes)."""
 CHUNK = 4

@@ -106,7 +106,7 @@ class Fault(Expression, ABC):
 
     @abstractmethod
     def install(self, injection: Injection) -> None:
-        """Say what happens in a world when the fault begins and ends."""
+        """Schedule what the fault does to a world when it begins and ends."""
 
     @property
     def end(self) -> float:

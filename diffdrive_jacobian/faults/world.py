@@ -86,7 +86,7 @@ class Hang(NodeFault):
     """
 
     def install(self, injection: Injection) -> None:
-        """Hold the callbacks of the node."""
+        """Delay the callbacks of the node until the fault ends."""
         gate = injection.gate(self.node)
 
         def freeze() -> Undo:

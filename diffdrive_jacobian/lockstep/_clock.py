@@ -96,7 +96,7 @@ class Clocks:
             self.publisher.publish(self._message)
 
     def shift(self, duration: int) -> int:
-        """Let the clocks jump by a time (ns). Return by how much they did.
+        """Shift the clocks (ns). Return the difference that was applied (ns).
 
         The new time is one that a stamp can represent.
         """

@@ -74,12 +74,12 @@ class Gate:
         self._change()
 
     def slow(self, cost: int) -> None:
-        """Let each callback take a time (ns)."""
+        """Add a duration to each callback (ns)."""
         self.costs.append(cost)
         self._update()
 
     def quicken(self, cost: int) -> None:
-        """Let callbacks not take this time any more."""
+        """Remove a duration that `slow` has added (ns)."""
         self.costs.remove(cost)
         self._update()
 

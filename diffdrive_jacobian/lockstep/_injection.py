@@ -44,7 +44,7 @@ class Fault(Protocol):
         """How long it lasts (s)."""
 
     def install(self, injection: Injection) -> None:
-        """Say what happens when it begins and ends."""
+        """Schedule what the fault does when it begins and ends."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class World:
         self.scheduler.kill(node)
 
     def shift_clock(self, duration: int) -> int:
-        """Let the clock of the nodes jump by a time (ns). Return by how much it did."""
+        """Shift the clock of the nodes (ns). Return the difference that was applied (ns)."""
         return self.scheduler.clocks.shift(duration)
 
     def pause_clock(self) -> Undo:

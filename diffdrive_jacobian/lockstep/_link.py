@@ -200,7 +200,7 @@ class Link:
         return True
 
     def arrive(self, taken: Taken) -> None:
-        """Let a message pass the gate of the receiver, at once or later."""
+        """Deliver a message through the gate of the receiver, at once or later."""
         if self._gate.free:
             self._hand_over(taken)
         else:
