@@ -10,7 +10,9 @@ directory of the same prefix holds the .msg file. All of that is checked without
 from __future__ import annotations
 
 import json
+import os
 import re
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -249,14 +251,14 @@ def _file(package: str, message: str, ending: str) -> Path:
 
 def _prefixes(package: str) -> list[Path]:
     """Return the installation prefixes that the module which `import` would find may belong to."""
+    # Code beside a bag is not installed: it is found by a relative entry, or in the current directory.
+    here = Path.cwd()
+    installed = [entry for entry in sys.path if os.path.isabs(entry) and Path(entry).resolve() != here]
     # For a name without dots this imports nothing, not even a parent.
-    spec = PathFinder.find_spec(package)
-    if spec is None or spec.origin is None:
+    spec, expected = PathFinder.find_spec(package), PathFinder.find_spec(package, installed)
+    if spec is None or spec.origin is None or expected is None or spec.origin != expected.origin:
         return []
     library = Path(spec.origin).parent.parent
-    # With an empty entry in PYTHONPATH a package in the current directory would be found.
-    if not library.is_absolute() or library.resolve() == Path.cwd():
-        return []
     return [
         prefix
         for prefix in library.parents

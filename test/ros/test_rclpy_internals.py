@@ -255,7 +255,7 @@ def test_events_executor_runs_a_task_after_the_queued_events(events, node):
 
 def test_entities_of_a_node_are_counted(node):
     before = internals.entity_count(node)
-    node.create_timer(1.0, print)
+    node.create_timer(1.0, lambda: None)
     node.create_client(GetParameters, 'get')
     assert internals.entity_count(node) == before + 2
     node.create_subscription(String, 'words', [].append, 2000)

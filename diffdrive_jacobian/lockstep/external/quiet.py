@@ -32,6 +32,8 @@ NEVER = -1
 """Place of a timeout that there is not."""
 SLEEPS = {'x86_64': (b'35', b'230'), 'aarch64': (b'101', b'115')}
 """Numbers of the system calls nanosleep and clock_nanosleep, by machine."""
+SELECTS = {'x86_64': (b'23', b'270'), 'aarch64': (b'72',)}
+"""Numbers of select: with a timeout and without a file it sleeps, as `time.sleep` of Python 3.10 does."""
 WAITS = {
     'x86_64': {
         **{b'202': 3, b'7': 2, b'271': 2, b'23': 4, b'270': 4, b'232': 3, b'281': 3},
@@ -148,7 +150,8 @@ class Quiet:
         Raises:
             LockstepError: The process may not be observed.
         """
-        self._sleeps, self._waits = SLEEPS[platform.machine()], WAITS[platform.machine()]
+        machine = platform.machine()
+        self._sleeps, self._selects, self._waits = SLEEPS[machine], SELECTS[machine], WAITS[machine]
         self._links = {pid: 0}
         """Number of links of the folder of the threads, by process: it changes with their number."""
         self._loadavg = os.open('/proc/loadavg', os.O_RDONLY)
@@ -304,13 +307,13 @@ class Quiet:
             return True
         if place is None:
             return self._is_active(thread)
-        if (
-            place != NEVER
-            and arguments[place] not in ENDLESS
-            and self._is_in_callback(thread, arguments)
-        ):
-            self._why = IN_CALLBACK
-            return True
+        if place != NEVER and arguments[place] not in ENDLESS:
+            if number in self._selects and arguments[0] == b'0x0':
+                self._why = 'sleeps'
+                return True
+            if self._is_in_callback(thread, arguments):
+                self._why = IN_CALLBACK
+                return True
         thread.idle = call
         return False
 
