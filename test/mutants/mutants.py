@@ -51,6 +51,8 @@ CACHE = ROOT / 'build' / 'mutants'
 PACKAGES = (
     *('kinematics', 'control', 'simulation', 'calibration'),
     *('messages', 'lockstep', 'bags', 'recording'),
+    *('nodes', 'ros', 'parameters', 'numerics', 'properties', 'faults', 'exploration', 'testing'),
+    *('tools', 'live', 'plots'),
 )
 LEFT_OUT = {
     *('test_documents', 'test_explored_nodes', 'test_fastdds_profiles', 'test_flood', 'test_forked'),
