@@ -277,8 +277,7 @@ def agree(quoted: str, printed: str, exact: bool) -> bool:
         return False
     pairs = zip(NUMBER.finditer(quoted), NUMBER.finditer(printed), strict=True)
     return not exact or all(
-        abs(Decimal(a[0]) - Decimal(b[0])) <= (last_place(a[0]) if a[1] or a[2] else 0)
-        for a, b in pairs
+        abs(Decimal(a[0]) - Decimal(b[0])) <= (last_place(a[0]) if a[1] or a[2] else 0) for a, b in pairs
     )
 
 
@@ -325,7 +324,7 @@ def run_page(text: str, directory: Path) -> list[tuple[Block, str]]:
 # --- Parameter tables
 
 
-@mock.patch('importlib.metadata.entry_points', lambda **_: ())
+@mock.patch('importlib.metadata.entry_points', new=mock.Mock(return_value=()))
 def parameter_table(parameters: type[NodeParameters]) -> str:
     """Return the table of the parameters of a node, without controllers that others have installed."""
     values = {field.name: field.default for field in fields(parameters)}

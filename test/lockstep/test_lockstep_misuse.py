@@ -316,7 +316,8 @@ def test_a_quality_of_service_without_a_remedy_is_named(lockstep):
         ('alive', 'liveliness manual by topic', {'liveliness': manual}),
         ('leased', 'lease 0.1 s', {'liveliness_lease_duration': short}),
     ):
-        planner.create_subscription(Vector3, topic, lambda message: None, QoSProfile(depth=1, **policies))
+        profile = QoSProfile(depth=1, **policies)
+        planner.create_subscription(Vector3, topic, lambda message: None, profile)
         for latched in (False, True):
             with refused(rf'/{topic} is subscribed to by /planner .*, {words}, and .* not reach it\n'):
                 lockstep.publish(topic, Vector3(), latched=latched)

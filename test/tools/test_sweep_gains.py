@@ -158,7 +158,7 @@ def test_means_are_over_those_that_arrived_and_the_fastest_is_one_from_which_all
 
 
 def test_a_setup_checks_itself():
-    with pytest.raises(ValueError, match="controller must be one of '.*'offset_point'"):
+    with pytest.raises(ValueError, match=r"controller must be one of '.*'offset_point'"):
         SweepSetup(controller='other')
     with pytest.raises(ValueError, match="gains must be of kv, offset, those of 'offset_point'"):
         SweepSetup(controller='offset_point', gains={'kp': 1.0})

@@ -33,7 +33,7 @@ NEVER = -1
 SLEEPS = {'x86_64': (b'35', b'230'), 'aarch64': (b'101', b'115')}
 """Numbers of the system calls nanosleep and clock_nanosleep, by machine."""
 SELECTS = {'x86_64': (b'23', b'270'), 'aarch64': (b'72',)}
-"""Numbers of select: with a timeout and without a file it sleeps, as `time.sleep` of Python 3.10 does."""
+"""Numbers of select: with a timeout and no file it sleeps, as `time.sleep` of Python 3.10 does."""
 WAITS = {
     'x86_64': {
         **{b'202': 3, b'7': 2, b'271': 2, b'23': 4, b'270': 4, b'232': 3, b'281': 3},
