@@ -313,6 +313,9 @@ class BoundLaw:
         self._size = size
         # An equation is given floats that are checked already; another law may index arrays.
         self._equation = getattr(controller.law, 'formula', None)
+        self._for_floats: Any = None
+        if self._equation is not None and not controller.state:
+            self._for_floats = controller.law
         self.now = 0
         """Time of the next pose (ns). Needed by laws with a state."""
         self._before: int | None = None
@@ -331,7 +334,10 @@ class BoundLaw:
         """Return the twist."""
         name, state = self.controller.name, self._state
         try:
-            twist = self._evaluated(pose, goal)
+            if self._for_floats is not None and type(goal) is tuple:
+                twist = self._for_floats.floats(pose, goal[: self._size], *self._values)
+            else:
+                twist = self._evaluated(pose, goal)
         except Exception as error:
             raise LawError(f'the law of controller {name!r} failed: {_reason(error)}') from error
         try:
@@ -342,7 +348,8 @@ class BoundLaw:
                 state = tuple(map(float, state))
             else:
                 v, omega = twist
-            v, omega = _number(v), _number(omega)
+            if not type(v) is type(omega) is float:
+                v, omega = _number(v), _number(omega)
         except (TypeError, ValueError) as error:
             raise LawError(
                 f'the law of controller {name!r} must return (v, omega), two numbers'

@@ -88,7 +88,7 @@ class Arrival(Comparable):
 
     def reached(self, x: float, y: float, theta: float, x_goal: float, y_goal: float) -> bool:
         """Return whether the distance to a goal is within the tolerance, without checks."""
-        distance = distance_to_goal.formula(x, y, theta, x_goal, y_goal, self.offset)
+        distance = distance_to_goal.floats(x, y, theta, x_goal, y_goal, self.offset)
         return bool(distance <= self.xy_tolerance)
 
     def faces(self, theta: Any, heading: Any) -> Any:
@@ -163,10 +163,22 @@ class Waypoints:
         Raises:
             ValueError: An argument is of another class or shape, or not finite.
         """
-        x, y, theta = numbers('pose', pose, 3)
+        numbers('pose', pose, 3)
         function('law', law)
         instance('arrival', arrival, Arrival)
         number('turning_gain', turning_gain, finite)
+        return self.step(pose, lambda at, goal: law(at, np.array(goal)), arrival, turning_gain, twist)
+
+    def step(
+        self,
+        pose: Pose,
+        law: Law,
+        arrival: Arrival,
+        turning_gain: float,
+        twist: tuple[float, float] = STANDSTILL,
+    ) -> tuple[Waypoints, tuple[Any, Any] | None]:
+        """As `follow`, of values that were checked. The law is given the goal as a tuple of floats."""
+        x, y, theta = pose
         here = self
         if here.turning and not arrival.use_heading:
             # The heading no longer counts, and the position was reached.
@@ -174,7 +186,7 @@ class Waypoints:
         while not here.turning:
             goal = here._goal
             if not arrival.reached(x, y, theta, goal[0], goal[1]):
-                return here, law(pose, here.poses[here.index])
+                return here, law(pose, goal)
             if here.index + 1 < len(here.poses):
                 here = here._progressed(here.index + 1, turning=False)
             elif not arrival.stopped(*twist):

@@ -7,7 +7,7 @@ Source: doc/mathematics.md, "Control laws".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any
 
@@ -23,7 +23,7 @@ from diffdrive_jacobian.numerics.checks import (
     positive,
     positive_or_infinite,
 )
-from diffdrive_jacobian.numerics.elementary import maximum, minimum, where
+from diffdrive_jacobian.numerics.elementary import all_finite, maximum, minimum, where
 from diffdrive_jacobian.numerics.fields import instance
 from diffdrive_jacobian.numerics.formula import Number, formula
 
@@ -51,21 +51,20 @@ class VelocityLimits(Comparable):
     """Fastest counter-clockwise yaw rate (rad/s)."""
     max_wheel_speed: Annotated[Any, partial(constant, check=positive_or_infinite)] = np.inf
     """Largest absolute speed of either wheel (rad/s)."""
+    alike: bool = field(init=False, repr=False)
+    """Whether every limit is a number, equal for all robots."""
+    unlimited: bool = field(init=False, repr=False)
+    """Whether no limit is set."""
 
     def __post_init__(self) -> None:
         """Check every limit."""
         Comparable.__post_init__(self)
-        leading(**{name: np.shape(limit) for name, limit in zip(self.names(), self.all(), strict=True)})
-
-    @property
-    def unlimited(self) -> bool:
-        """Whether no limit is set."""
-        return self.alike and self.all() == (-np.inf, np.inf, -np.inf, np.inf, np.inf)
-
-    @property
-    def alike(self) -> bool:
-        """Whether every limit is a number, equal for all robots."""
-        return all(isinstance(limit, float) for limit in self.all())
+        limits = self.all()
+        leading(**{name: np.shape(limit) for name, limit in zip(self.names(), limits, strict=True)})
+        alike = all(isinstance(limit, float) for limit in limits)
+        object.__setattr__(self, 'alike', alike)
+        unlimited = alike and limits == (-np.inf, np.inf, -np.inf, np.inf, np.inf)
+        object.__setattr__(self, 'unlimited', unlimited)
 
     def all(self) -> tuple[Any, ...]:
         """Return the limits, in the order of `names`."""
@@ -121,20 +120,17 @@ def scaled_to_limits(
     v_limit, omega_limit = where(v > 0.0, max_v, min_v), where(omega > 0.0, max_omega, min_omega)
     v, omega = where(v_limit == 0.0, 0.0, v), where(omega_limit == 0.0, 0.0, omega)
 
-    # By what factor the twist exceeds its limits.
-    v_excess = v / where(v_limit == 0.0, 1.0, v_limit)
-    omega_excess = omega / where(omega_limit == 0.0, 1.0, omega_limit)
-    excess = maximum(1.0, v_excess, omega_excess, fastest_wheel(v, omega, r, L) / max_wheel_speed)
-    if not np.isfinite(excess).all():
+    # By what factor the twist exceeds its limits; where both are zero, 0 / 1.
+    v_excess = v / (v_limit + (v_limit == 0.0))
+    omega_excess = omega / (omega_limit + (omega_limit == 0.0))
+    wheel_excess = (abs(v) + abs(omega * L / 2.0)) / r / max_wheel_speed
+    excess = maximum(1.0, v_excess, omega_excess, wheel_excess)
+    if not all_finite(excess):
         raise ValueError('v, omega, the limits, r and L must give finite speeds, but they overflow')
     v, omega = v / excess, omega / excess
 
     # The quotients round. A limit is never exceeded, not by the last bit either.
     v, omega = maximum(min_v, minimum(v, max_v)), maximum(min_omega, minimum(omega, max_omega))
-    exact = where(fastest_wheel(v, omega, r, L) <= max_wheel_speed, 1.0, 1.0 - ROUNDING)
+    beyond = (abs(v) + abs(omega * L / 2.0)) / r > max_wheel_speed
+    exact = 1.0 - ROUNDING * beyond
     return v * exact, omega * exact
-
-
-def fastest_wheel(v: Number, omega: Number, r: Number, L: Number) -> Number:
-    """Return the speed of the faster wheel, shape (...) (rad/s)."""
-    return (abs(v) + abs(omega * L / 2.0)) / r

@@ -12,8 +12,8 @@ Source: doc/mathematics.md, "Motion"; document B for the homogeneous transform.
 
 from __future__ import annotations
 
-from diffdrive_jacobian.numerics import elementary
 from diffdrive_jacobian.numerics.elementary import cos, sin, sinc_defect, wrap
+from diffdrive_jacobian.numerics.elementary import sinc as sin_ratio
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 __all__ = [
@@ -48,7 +48,7 @@ def sinc(angle: Number) -> Number:
 
     Angles have any shape (rad).
     """
-    return elementary.sinc(angle)
+    return sin_ratio(angle)
 
 
 @formula('(3) -> (3)')
@@ -61,8 +61,8 @@ def exp(twist: Vector) -> Entries:
     """
     vx, vy, turn = twist
     # sin(a)/a and (1 - cos(a))/a, of the half angle, so that small turns lose no digits.
-    along = elementary.sinc(turn / 2.0) * cos(turn / 2.0)
-    across = elementary.sinc(turn / 2.0) * sin(turn / 2.0)
+    along = sin_ratio(turn / 2.0) * cos(turn / 2.0)
+    across = sin_ratio(turn / 2.0) * sin(turn / 2.0)
     return [along * vx - across * vy, across * vx + along * vy, wrap(turn)]
 
 
@@ -74,7 +74,7 @@ def log(pose: Vector) -> Entries:
     """
     x, y, theta = pose
     half = wrap(theta) / 2.0
-    along = cos(half) / elementary.sinc(half)
+    along = cos(half) / sin_ratio(half)
     return [along * x + half * y, along * y - half * x, wrap(theta)]
 
 
@@ -127,7 +127,7 @@ def left_jacobian(twist: Vector) -> Rows:
     estimation problems", 2014, for SE(3); here for SE(2).
     """
     vx, vy, turn = twist
-    chord = elementary.sinc(turn / 2.0)
+    chord = sin_ratio(turn / 2.0)
     # sin(a)/a, (1 - cos(a))/a, (1 - cos(a))/a^2 and (a - sin(a))/a^2 of the turn a.
     along, across = chord * cos(turn / 2.0), chord * sin(turn / 2.0)
     bent, bowed = chord * chord / 2.0, turn * sinc_defect(turn)
@@ -192,6 +192,6 @@ def integrate(pose: Vector, twist: Vector, dt: Number) -> Entries:
     x, y, theta = pose
     v, omega = twist
     turn = omega * dt
-    chord = v * dt * elementary.sinc(turn / 2.0)
+    chord = v * dt * sin_ratio(turn / 2.0)
     heading = theta + turn / 2.0
     return [x + chord * cos(heading), y + chord * sin(heading), wrap(theta + turn)]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Callable, Iterable
 from itertools import count
+from operator import itemgetter
 
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
@@ -15,7 +17,14 @@ from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.messages.conversion import set_time
-from diffdrive_jacobian.ros.rclpy_internals import RCLError, SimulatedClock, TimerHandle, timer_handle
+from diffdrive_jacobian.ros.rclpy_internals import (
+    RCLError,
+    SimulatedClock,
+    TimerHandle,
+    set_clocks,
+    subscription_counter,
+    timer_handle,
+)
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_SECONDS = 2**31 - 1
@@ -35,22 +44,21 @@ class Agenda:
         """Start without actions."""
         self.now = 0
         """World time (ns)."""
+        self.next: float = math.inf
+        """World time of the next action (ns); infinity: there is none."""
         self._entries: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = count()
 
     def at(self, time: int, action: Callable[[], None]) -> None:
         """Add an action at a time (ns). One in the past is due now."""
         heapq.heappush(self._entries, (max(time, self.now), next(self._numbers), action))
+        self.next = self._entries[0][0]
 
-    def until_next(self) -> int | None:
-        """Return the time until the next action (ns); None: there is none."""
-        return self._entries[0][0] - self.now if self._entries else None
-
-    def pop_due(self) -> Callable[[], None] | None:
-        """Return the next action that is due, and forget it; None: there is none."""
-        if self._entries and self._entries[0][0] <= self.now:
-            return heapq.heappop(self._entries)[2]
-        return None
+    def pop(self) -> Callable[[], None]:
+        """Return the next action, and forget it."""
+        _, _, action = heapq.heappop(self._entries)
+        self.next = self._entries[0][0] if self._entries else math.inf
+        return action
 
 
 class Clocks:
@@ -63,19 +71,23 @@ class Clocks:
         """Start without clocks, at a time (ns)."""
         self.now = now
         """Simulated time (ns), which the clocks show after `set`."""
-        self.publisher: Publisher | None = None
-        """Publisher of /clock."""
+        self._publisher: Publisher | None = None
+        self._count_subscriptions: Callable[[], int] = lambda: 0
         self.pauses = 0
         """Number of faults because of which the clocks stand."""
         self._clocks: list[SimulatedClock] = []
         self._message = Clock()
+
+    def publish_with(self, publisher: Publisher) -> None:
+        """Publish the time with a publisher of /clock."""
+        self._publisher, self._count_subscriptions = publisher, subscription_counter(publisher)
 
     def find(self, nodes: Iterable[Node]) -> set[Subscription]:
         """Find the clocks of nodes. Return the subscriptions to /clock that are replaced.
 
         A clock whose topic was renamed follows that topic.
         """
-        topic = self.publisher and self.publisher.topic_name
+        topic = self._publisher and self._publisher.topic_name
         replaced = set()
         self._clocks = []
         for node in nodes:
@@ -88,12 +100,10 @@ class Clocks:
     def set(self) -> None:
         """Set the clocks to the present time, and publish it if somebody else receives it."""
         now = self.now
-        time = Time(nanoseconds=now, clock_type=ClockType.ROS_TIME)
-        for clock in self._clocks:
-            clock.set(time)
-        if self.publisher is not None and self.publisher.get_subscription_count() > len(self._clocks):
+        set_clocks(self._clocks, Time(nanoseconds=now, clock_type=ClockType.ROS_TIME))
+        if self._publisher is not None and self._count_subscriptions() > len(self._clocks):
             set_time(self._message.clock, now)
-            self.publisher.publish(self._message)
+            self._publisher.publish(self._message)
 
     def shift(self, duration: int) -> int:
         """Shift the clocks (ns). Return the difference that was applied (ns).
@@ -111,40 +121,44 @@ class Timers:
 
     def __init__(self) -> None:
         """Start without timers."""
-        # With their handles, whose methods take a third of the time of those of the timers.
-        self._sim_timers: list[Entry] = []
-        self._wall_timers: list[Entry] = []
-        self._simulated: set[Timer] = set()
+        # Each with the method of its handle, which takes a third of the time of that of the timer.
+        self._sim_timers: list[tuple[Callable[[], int | None], Entry]] = []
+        self._wall_timers: list[tuple[Callable[[], int | None], Entry]] = []
+        self.simulated: set[Timer] = set()
+        """Those that expire by simulated time, as of the last `update`."""
 
     def update(self, timers: Iterable[tuple[Timer, Node]]) -> None:
         """Take the timers that may tick, each with its node."""
-        entries = [(timer_handle(timer), timer, node) for timer, node in timers]
-        self._sim_timers = [entry for entry in entries if follows_sim_time(entry[1])]
-        self._simulated = {timer for _, timer, _ in self._sim_timers}
-        self._wall_timers = [entry for entry in entries if entry[1] not in self._simulated]
+        self._sim_timers, self._wall_timers = [], []
+        for timer, node in timers:
+            handle = timer_handle(timer)
+            of_kind = self._sim_timers if follows_sim_time(timer) else self._wall_timers
+            of_kind.append((handle.time_until_next_call, (handle, timer, node)))
+        self.simulated = {timer for _, (_, timer, _) in self._sim_timers}
 
-    def is_simulated(self, timer: Timer) -> bool:
-        """Return whether a timer of the nodes expires by simulated time, as of the last `update`."""
-        return timer in self._simulated
+    def due(self) -> tuple[list[tuple[int, Entry]], float]:
+        """Return the due timers, the most overdue first, each with the time until it is due (ns).
 
-    def due(self) -> tuple[list[Entry], int | None]:
-        """Return the due timers, the most overdue first, and the time until the next one (ns)."""
-        due, until_next = [], None
-        for entry in self._sim_timers:
-            left = entry[0].time_until_next_call()
+        And the time until the next one in simulated time (ns); infinity: there is none.
+        """
+        due: list[tuple[int, Entry]] = []
+        until_next = math.inf
+        for time_until, entry in self._sim_timers:
+            left = time_until()
             if left is None:
                 continue
             if left <= 0:
                 due.append((left, entry))
-            elif until_next is None or left < until_next:
+            elif left < until_next:
                 until_next = left
-        for entry in self._wall_timers:
-            left = entry[0].time_until_next_call()
+        for time_until, entry in self._wall_timers:
+            left = time_until()
             if left is not None and left <= 0:
                 due.append((left, entry))
-        # Sorting is stable: timers that are due at the same time stay in the order of their creation.
-        due.sort(key=lambda item: item[0])
-        return [entry for _, entry in due], until_next
+        if len(due) > 1:
+            # Stable: timers that are due at the same time stay in the order of their creation.
+            due.sort(key=itemgetter(0))
+        return due, until_next
 
     def most_overdue(self, node: Node) -> tuple[int, TimerHandle, Timer] | None:
         """Return the most overdue timer of a node, and for how long it has been due (ns).
@@ -152,9 +166,9 @@ class Timers:
         None: no timer is due.
         """
         due, _ = self.due()
-        for handle, timer, owner in due:
-            if owner is node and timer in self._simulated:
-                return -(handle.time_until_next_call() or 0), handle, timer
+        for left, (handle, timer, owner) in due:
+            if owner is node and timer in self.simulated:
+                return -left, handle, timer
         return None
 
 

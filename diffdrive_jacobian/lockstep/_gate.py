@@ -57,7 +57,8 @@ class Gate:
         self.waiting: deque[Waiting] = deque()
         """Callbacks that wait, the oldest first."""
         self._lost: Counter[str] = Counter()
-        self._delayed: set[Timer] = set()
+        self.delayed: set[Timer] = set()
+        """Timers whose delay is over."""
         self._holds = 0
         self._busy = False
         self._outbox: list[Callable[[], None]] = []
@@ -170,8 +171,8 @@ class Gate:
         """Return whether a timer that is due ticks now. Otherwise it does later."""
         if self.closed:
             return False
-        if timer in self._delayed:
-            self._delayed.remove(timer)
+        if timer in self.delayed:
+            self.delayed.remove(timer)
             return True
         delay = sum(draw() for draw in self.timer_delays)
         if delay == 0:
@@ -183,7 +184,7 @@ class Gate:
 
     def _resume(self, timer: Timer) -> None:
         self.suspended.discard(timer)
-        self._delayed.add(timer)
+        self.delayed.add(timer)
         self._change()
 
     # --- Out

@@ -11,6 +11,7 @@ receive.
 
 from __future__ import annotations
 
+import inspect
 from collections import deque
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -69,13 +70,11 @@ class Source:
     """What one publisher of a node publishes."""
 
     __slots__ = (
-        'at',
         'count',
+        'last',
         'links',
-        'message',
         'message_type',
         'observers',
-        'order',
         'owner',
         'stages',
         'topic',
@@ -99,11 +98,11 @@ class Source:
         self.owner: Node | None = None
         """The node of the publisher. None: it was not added yet."""
         self.stages: list[Stage] = []
-        self.count = self.at = self.order = 0
-        """Number of messages, time of the last one by the clock of the nodes (ns), and its number among
-        those of all sources."""
-        self.message: Any = None
-        """The last message."""
+        self.count = 0
+        """Number of messages."""
+        self.last: tuple[int, int, Any] = 0, 0, None
+        """The last message: its number among those of all sources, its time by the clock of the nodes
+        (ns), and the message."""
 
     def received(self) -> Any:
         """Return the last message as a subscription received it.
@@ -111,11 +110,12 @@ class Source:
         The message of the publisher may differ: an int in a field for a float is another number on the
         wire. One that has been modified and cannot be serialized any more is returned itself.
         """
+        _, _, message = self.last
         try:
-            data = self.message if isinstance(self.message, bytes) else serialize_message(self.message)
+            data = message if isinstance(message, bytes) else serialize_message(message)
             return deserialize_message(data, self.message_type)
         except Exception:
-            return self.message
+            return message
 
 
 class Link:
@@ -123,6 +123,7 @@ class Link:
 
     __slots__ = (
         '_agenda',
+        '_create_task',
         '_gate',
         '_pending',
         '_ready',
@@ -151,7 +152,8 @@ class Link:
         pending: deque[Link | None],
         observers: list[Delivered],
         take: Callable[[type, bool], Taken | None],
-        receive: Callable[[Taken], object],
+        receive: Callable[[Taken], Any],
+        create_task: Callable[[Any], object],
         release: Callable[[], None],
     ) -> None:
         """Start without stages.
@@ -165,7 +167,8 @@ class Link:
             observers: The functions that are called before each message is received.
             take: Takes a message of a type, or its bytes, from the queue of the receiver. Returns None
                 if there is none.
-            receive: Lets the receiver process a message.
+            receive: Lets the receiver process a message. Its result may be a coroutine.
+            create_task: Continues that coroutine later.
             release: Ends the use of `take`.
         """
         self.endpoint = endpoint
@@ -182,6 +185,7 @@ class Link:
         self._agenda = agenda
         self._pending = pending
         self._receive = receive
+        self._create_task = create_task
         self._release = release
         self._ready: deque[Taken] = deque()
         """Messages that have passed all stages."""
@@ -192,26 +196,27 @@ class Link:
         self.take = self._take_passed
 
     def deliver(self) -> bool:
-        """Take a message and let it be received. Return False if there is none."""
+        """Take a message and let it through the gate of the receiver, at once or later.
+
+        Return False if there is none.
+        """
         taken = self.take(self.message_type, self.raw)
         if taken is None:
             return False
-        self.arrive(taken)
-        return True
-
-    def arrive(self, taken: Taken) -> None:
-        """Deliver a message through the gate of the receiver, at once or later."""
         if self._gate.free:
             self._hand_over(taken)
         else:
             self._gate.enter(self, self.topic, partial(self._hand_over, taken), self.depth)
+        return True
 
     def _hand_over(self, taken: Taken) -> None:
         """Let the receiver process a message."""
         if self.observers:
             for observer in self.observers:
                 observer(self.owner, self.message_type, taken[0])
-        self._receive(taken)
+        result = self._receive(taken)
+        if result is not None and inspect.iscoroutine(result):
+            self._create_task(result)
 
     def _take_passed(self, message_type: type, raw: bool) -> Taken | None:
         ready = self._ready

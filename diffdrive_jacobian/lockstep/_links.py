@@ -11,9 +11,8 @@ Messages are not copied, so one that its node modifies after publishing is repor
 
 from __future__ import annotations
 
-import inspect
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Container, Iterable
 from functools import partial
 from itertools import count
@@ -26,10 +25,10 @@ from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.lockstep._clock import Agenda, Clocks
 from diffdrive_jacobian.lockstep._gate import Gates, send_unless_destroyed
-from diffdrive_jacobian.lockstep._link import Delivered, Link, Published, Source, Stage, Taken, pass_on
+from diffdrive_jacobian.lockstep._link import Delivered, Link, Published, Source, Stage, pass_on
 from diffdrive_jacobian.lockstep._services import Member
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
-from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info, wrap_publish
+from diffdrive_jacobian.ros.rclpy_internals import message_receiver, message_taker, wrap_publish
 
 Filter = Callable[[Source | Link], Stage | None]
 """Returns the stage of a fault at one end of a link; None: the fault does not affect it."""
@@ -73,7 +72,9 @@ class Links:
         self._by_topic: dict[str, list[Link]] = {}
         self._published: dict[str, list[Published]] = {}
         self._delivered: dict[str, list[Delivered]] = {}
-        self._polled: list[Link] = []
+        self._admitted: set[Link] = set()
+        self.polled: list[Link] = []
+        """Links whose topic has publishers that cannot be observed."""
         self._filters: list[Filter] = []
         self._members: Iterable[Node] = ()
         self._numbers = count(1)
@@ -136,9 +137,7 @@ class Links:
                     return
                 publish(self, msg)
                 source.count += 1
-                source.order = next(numbers)
-                source.at = clocks.now
-                source.message = msg
+                source.last = next(numbers), clocks.now, msg
                 extend(source.links)
                 if source.observers:
                     for observer in source.observers:
@@ -192,12 +191,18 @@ class Links:
 
     # --- Receiving
 
-    def update(self, members: Iterable[Member], without: Container[Subscription] = ()) -> list[Link]:
+    def update(
+        self,
+        members: Iterable[Member],
+        without: Container[Subscription] = (),
+        publishers: Iterable[Publisher] = (),
+    ) -> list[Link]:
         """Serve the present subscriptions of the nodes.
 
         Args:
             members: The nodes.
             without: Subscriptions that are not served.
+            publishers: All publishers of the context that can be observed.
 
         Returns:
             Those that wait for `admit`.
@@ -211,8 +216,13 @@ class Links:
                 self._links[subscription] = link or self._link(subscription, member)
         for link in known.values():
             link.close()
-        present = set(self._links.values())
-        self._polled = [link for link in self._polled if link in present]
+        self._admitted.intersection_update(self._links.values())
+        observable = Counter(publisher.topic_name for publisher in publishers)
+        self.polled = [
+            link
+            for link in self._links.values()
+            if link.owner.count_publishers(link.topic) > observable[link.topic]
+        ]
         for links in self._by_topic.values():
             links.clear()
         for link in self._links.values():
@@ -220,20 +230,11 @@ class Links:
         for publisher, source in self._sources.items():
             if source.owner is None:
                 self._find_owner(publisher, source)
-        admitted = set(self._polled)
-        return [link for link in self._links.values() if link not in admitted]
+        return [link for link in self._links.values() if link not in self._admitted]
 
     def _link(self, subscription: Subscription, member: Member) -> Link:
         """Return a new link to a subscription."""
         take, release = message_taker(subscription)
-
-        def receive(taken: Taken) -> None:
-            # The callback is looked up for each message, because it may be replaced.
-            callback = subscription.callback
-            result = callback(*taken) if receives_info(subscription) else callback(taken[0])
-            if result is not None and inspect.iscoroutine(result):
-                member.create_task(result)
-
         link = Link(
             subscription,
             member.node,
@@ -242,7 +243,8 @@ class Links:
             pending=self.pending,
             observers=self.observers_of_delivered(subscription.topic_name),
             take=take,
-            receive=receive,
+            receive=message_receiver(subscription),
+            create_task=member.create_task,
             release=release,
         )
         for stage in self._stages_of(link):
@@ -256,23 +258,19 @@ class Links:
             self._links.pop(subscription).close()
 
     def admit(self, link: Link) -> None:
-        """Deliver the messages that a new subscription has received before, and let it be polled."""
+        """Deliver the messages that a new subscription has received before."""
         while link.deliver():
             pass
-        self._polled.append(link)
+        self._admitted.add(link)
 
     def poll(self) -> bool:
-        """Deliver one message of each subscription that has any. Return whether there was one.
+        """Deliver one message of each subscription that is polled. Return whether there was one.
 
         rcl itself publishes some messages, for example the status of actions, which nobody can observe.
         """
         found = False
-        for link in self._polled:
-            # As `deliver`, without a call for each.
-            taken = link.take(link.message_type, link.raw)
-            if taken is not None:
-                link.arrive(taken)
-                found = True
+        for link in self.polled:
+            found |= link.deliver()
         return found
 
     def close(self) -> None:
@@ -289,4 +287,4 @@ class Links:
     def last(self, topic: str) -> Any:
         """Return the last message of a topic as it was received; None: there is none."""
         sources = [source for _, source in self.sources() if source.topic == topic]
-        return max(sources, key=lambda source: source.order).received() if sources else None
+        return max(sources, key=lambda source: source.last[0]).received() if sources else None

@@ -30,7 +30,7 @@ class Nodes:
         self._factories: dict[str, Callable[[], Node]] = {}
         self.own = Node('lockstep', start_parameter_services=False, enable_rosout=False)
         """The node of the test."""
-        scheduler.clocks.publisher = self.own.create_publisher(Clock, CLOCK, 1)
+        scheduler.clocks.publish_with(self.own.create_publisher(Clock, CLOCK, 1))
         self.observers = {self.own}
         """Nodes that belong to the test."""
         self.on_change: list[Callable[[], None]] = []

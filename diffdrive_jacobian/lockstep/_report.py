@@ -60,7 +60,7 @@ def describe(
         if source.topic not in NOT_OF_ROBOTS
     ]
     lines = [
-        f'  {topic}: {source.count} from {node}, last at {source.at / NANOSECONDS:g} s: '
+        f'  {topic}: {source.count} from {node}, last at {source.last[1] / NANOSECONDS:g} s: '
         f'{brief(source.received())}'
         for topic, node, source in sorted(published, key=lambda item: item[:2])
     ]

@@ -9,6 +9,7 @@ processed: the EventsExecutor would call them from a second thread, at times and
 from __future__ import annotations
 
 import inspect
+import math
 import threading
 import weakref
 from collections.abc import Callable
@@ -183,17 +184,17 @@ class Scheduler:
 
     # --- Work
 
-    def settle(self) -> int | None:
+    def settle(self) -> float:
         """Execute all callbacks that are due at the current time, and all that they cause.
 
         Returns:
-            Time until the next timer in simulated time expires, or the next action is due (ns); None:
-            there is none.
+            Time until the next timer in simulated time expires, or the next action is due (ns);
+            infinity: there is none.
         """
         self.handle_all()
         return self._call_timers()[1]
 
-    def catch_up(self) -> int | None:
+    def catch_up(self) -> float:
         """Settle, after little or nothing was done since the last time.
 
         It takes a tenth of the time of `settle` if no message or request was sent, no task or entity was
@@ -205,7 +206,7 @@ class Scheduler:
                 return self._sooner(until_next)
         return self.settle()
 
-    def advance(self) -> int | None:
+    def advance(self) -> float:
         """Set the clocks of the nodes to the present time, and settle."""
         if not self.clocks.pauses:
             self.clocks.set()
@@ -217,36 +218,34 @@ class Scheduler:
 
     def _has_work(self) -> bool:
         """Return whether anything waits to be executed, or may wait without having been noticed."""
-        return bool(self.links.pending or self._changed or self.tasks or self._has_actions)
+        return bool(self.links.pending or self._changed or self.tasks.waiting or self._has_actions)
 
-    def _sooner(self, until_next: int | None) -> int | None:
-        """Return the time until the next timer or action (ns); None: there is none."""
+    def _sooner(self, until_next: float) -> float:
+        """Return the time until the next timer or action (ns); infinity: there is none."""
         if self.clocks.pauses:
-            until_next = None
-        until_action = self.agenda.until_next()
-        if until_action is None or until_next is None:
-            return until_action if until_next is None else until_next
-        return min(until_action, until_next)
+            until_next = math.inf
+        # The minimum of integers is exact, also beside infinity.
+        return min(until_next, self.agenda.next - self.agenda.now)
 
-    def _call_timers(self) -> tuple[bool, int | None]:
+    def _call_timers(self) -> tuple[bool, float]:
         """Execute the actions and the timers that are due, and all callbacks that they cause.
 
         Returns:
             Whether there were any, and the time until the next timer expires, as of `settle`.
         """
-        called = False
+        called, agenda = False, self.agenda
         while True:
-            while (action := self.agenda.pop_due()) is not None:
+            while agenda.next <= agenda.now:
                 called = True
-                action()
+                agenda.pop()()
                 self.handle_all()
             due, until_next = self.timers.due()
             if not due:
                 return called, self._sooner(until_next)
-            for handle, timer, node in due:
-                if is_due(handle) and self._may_tick(timer, node):
+            for _, (handle, timer, node) in due:
+                # The callback of one may have cancelled the next.
+                if (len(due) == 1 or is_due(handle)) and self._tick(handle, timer, node):
                     called = True
-                    self._call_timer(handle, timer, node)
                     self.handle_all(after_callback=True)
 
     def handle_all(self, *, after_callback: bool = False) -> None:
@@ -259,10 +258,11 @@ class Scheduler:
         events = not after_callback or self._has_events
         while True:
             self._drain(events)
-            if self._register_changed():
+            if self._changed:
+                self._register_changed()
                 # A new client or service may already have been called.
                 events = True
-            elif not (self.tasks and self.tasks.run()):
+            elif not (self.tasks.waiting and self.tasks.run()):
                 return
 
     def _drain(self, events: bool = True) -> None:
@@ -271,7 +271,7 @@ class Scheduler:
         Args:
             events: Whether the EventsExecutor may have events although no request or response was sent.
         """
-        pending, poll = self.links.pending, self.links.poll
+        links, pending = self.links, self.links.pending
         take = pending.popleft
         while True:
             while pending:
@@ -280,7 +280,7 @@ class Scheduler:
                     events = True
                 else:
                     link.deliver()
-            if not ((events and self._handle_events()) or pending or poll() or pending):
+            if not ((events and self._handle_events()) or pending or (links.polled and links.poll())):
                 return
 
     def _handle_events(self) -> bool:
@@ -298,24 +298,23 @@ class Scheduler:
 
     # --- Timers and gates
 
-    def _may_tick(self, timer: Timer, node: Node) -> bool:
-        """Return whether a timer that is due ticks now. Otherwise it does later."""
-        gate = self._members[node].gate
-        return gate.may_tick(timer) if self.timers.is_simulated(timer) else not gate.closed
+    def _tick(self, handle: TimerHandle, timer: Timer, node: Node) -> bool:
+        """Call the callback of a timer that is due, if the gate of its node lets it tick now.
 
-    def _call_timer(self, handle: TimerHandle, timer: Timer, node: Node) -> None:
-        """Call the callback of a timer.
-
-        That of a timer on wall time takes no simulated time, because nobody knows when it comes.
+        Return whether it was called. That of a timer on wall time takes no simulated time, because nobody
+        knows when it comes.
         """
-        handle.call_timer()
         member = self._members[node]
-        if member.gate.costs and self.timers.is_simulated(timer):
-            result = member.gate.run(timer.callback)
-        else:
-            result = timer.callback()
-        if inspect.iscoroutine(result):
+        gate, simulated = member.gate, timer in self.timers.simulated
+        if not gate.free or gate.timer_delays or gate.delayed:
+            may_tick = gate.may_tick(timer) if simulated else not gate.closed
+            if not may_tick:
+                return False
+        handle.call_timer()
+        result = gate.run(timer.callback) if gate.costs and simulated else timer.callback()
+        if result is not None and inspect.iscoroutine(result):
             member.create_task(result)
+        return True
 
     def _update_timers(self) -> None:
         """Find the timers that may tick."""
@@ -345,8 +344,7 @@ class Scheduler:
         entry = self.timers.most_overdue(node) if gate.costs else None
         if entry is not None and self.agenda.now - entry[0] < gate.waiting[0].since:
             _, handle, timer = entry
-            if self._may_tick(timer, node):
-                self._call_timer(handle, timer, node)
+            self._tick(handle, timer, node)
         else:
             gate.serve_next()
 
@@ -360,17 +358,14 @@ class Scheduler:
         self._changed = True
         self.links.drop_destroyed(self._members)
 
-    def _register_changed(self) -> bool:
-        """Register if a node has created or destroyed an entity. Return whether one has."""
-        if not self._changed:
-            return False
+    def _register_changed(self) -> None:
+        """Register what the nodes have created or destroyed, again if that fails."""
         self._changed = False
         try:
             self._register()
         except BaseException:
             self._changed = True
             raise
-        return True
 
     def _register(self) -> None:
         """Register entities that the nodes have created since the last call, and forget destroyed ones.
@@ -393,7 +388,11 @@ class Scheduler:
         self._events.wake()
         # The registration itself does not count as an event.
         self._handle_events()
-        new = self.links.update(self._members.values(), self.clocks.find(self._members))
+        new = self.links.update(
+            self._members.values(),
+            self.clocks.find(self._members),
+            [publisher for node in self.existing for publisher in node.publishers],
+        )
         # Messages that a subscription has received before.
         for link in sorted(new, key=lambda link: link.latched):
             self.links.admit(link)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from typing import Protocol, TypeVar
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -21,7 +21,15 @@ from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
 from diffdrive_jacobian.time_units import NANOSECONDS
 
+T = TypeVar('T')
 SHUT_DOWN = 'rclpy was shut down: only lockstep may do that'
+
+
+class Process(Protocol):
+    """Another process, as far as time is concerned."""
+
+    def check(self) -> bool:
+        """Return whether it has caused callbacks at the present time."""
 
 
 class SimulatedTime:
@@ -48,12 +56,12 @@ class SimulatedTime:
         self._guard = guard
         self._check_open = check_open
         self._report = report
-        self._until_next: int | None = None
-        self.check_processes: Callable[[], bool] = lambda: False
-        """Called when all callbacks of a time have been executed, before `check`. Returns whether there
-        are others now."""
-        self.check: Callable[[], None] = lambda: None
-        """Called at each simulated time, when all callbacks have been executed."""
+        # Time until the next timer or action (ns).
+        self._until_next = math.inf
+        self.processes: list[Process] = []
+        """The other processes, which are checked when all callbacks of a time have been executed."""
+        self.check: Callable[[], None] | None = None
+        """Called after that, at each simulated time."""
         self.busy = False
         """Whether callbacks are being executed."""
 
@@ -61,10 +69,8 @@ class SimulatedTime:
         """Execute all callbacks that are due at the current time."""
         __tracebackhide__ = True
         self._check_open()
-        with self.watched():
-            self._until_next = self._scheduler.settle()
-        self._settle_processes()
-        self.check()
+        self._until_next = self.execute(self._scheduler.settle)
+        self._finish()
 
     def settle_unless_busy(self) -> None:
         """Settle, except within a callback, after which it happens anyway."""
@@ -75,23 +81,30 @@ class SimulatedTime:
     def _catch_up(self) -> None:
         """Execute what was caused since the last callback."""
         self._check_open()
-        with self.watched():
-            self._until_next = self._scheduler.catch_up()
+        self._until_next = self.execute(self._scheduler.catch_up)
         self._settle_processes()
 
     def _settle_processes(self) -> None:
         """Check the other processes, and execute what that causes."""
         __tracebackhide__ = True
-        while self.check_processes():
-            with self.watched():
-                self._until_next = self._scheduler.settle()
+        # One at a time: what a process still sends may be for another one.
+        while any(process.check() for process in self.processes):
+            self._until_next = self.execute(self._scheduler.settle)
+
+    def _finish(self) -> None:
+        """Check the processes and what is required, when all callbacks of a time have been executed."""
+        __tracebackhide__ = True
+        if self.processes:
+            self._settle_processes()
+        if self.check is not None:
+            self.check()
 
     def step(self, at_most: float | None) -> None:
         """Advance to the time at which the next timer expires, as `Lockstep.step`."""
         __tracebackhide__ = True
         end = math.inf if at_most is None else self._agenda.now + checked_nanoseconds('at_most', at_most)
         self._catch_up()
-        if self._until_next is None and at_most is None:
+        if self._until_next == math.inf and at_most is None:
             raise LockstepError('no timer is running, so step needs at_most')
         self._advance(end)
 
@@ -138,10 +151,10 @@ class SimulatedTime:
     def _advance(self, end: float) -> None:
         """Advance to the next timer or action, but not beyond an end of world time (ns)."""
         __tracebackhide__ = True
-        until_next = math.inf if self._until_next is None else self._until_next
+        agenda = self._agenda
         # The minimum of integers is exact, also beside infinity.
-        passed = int(min(until_next, end - self._agenda.now))
-        self._agenda.now += passed
+        passed = int(min(self._until_next, end - agenda.now))
+        agenda.now += passed
         if not self._clocks.pauses:
             self._clocks.now += passed
         self.arrive()
@@ -149,24 +162,24 @@ class SimulatedTime:
     def arrive(self) -> None:
         """Set the clocks of the nodes to the present time, and execute what is due then."""
         __tracebackhide__ = True
-        with self.watched():
-            self._until_next = self._scheduler.advance()
-        self._settle_processes()
-        self.check()
+        self._until_next = self.execute(self._scheduler.advance)
+        if self.processes or self.check is not None:
+            self._finish()
 
     # --- Execution
 
-    @contextmanager
-    def watched(self) -> Iterator[None]:
-        """Let callbacks be executed in the context."""
+    def execute(self, work: Callable[[], T]) -> T:
+        """Call a function that executes callbacks, and return its result."""
+        __tracebackhide__ = True
         if self.busy:
             raise LockstepError('a callback cannot advance time, and cannot add or remove nodes')
         self.busy = True
         self._guard.arm()
         try:
-            yield
+            result = work()
             if self._scheduler.links.elsewhere:
                 self.check_threads()
+            return result
         except ExternalShutdownException:
             raise LockstepError(SHUT_DOWN) from None
         except (Stuck, RuntimeError) as error:

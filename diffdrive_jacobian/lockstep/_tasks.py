@@ -19,18 +19,14 @@ class Tasks:
 
     def __init__(self) -> None:
         """Start without tasks."""
-        self._tasks: list[_Task] = []
-
-    def __len__(self) -> int:
-        """Return the number of tasks that are not done."""
-        return len(self._tasks)
+        self.waiting: list[_Task] = []
 
     def create(self, owner: Node, gate: Gate, callback: Any, args: Any, kwargs: Any) -> Task:
         """Add a function or a coroutine of a node with a gate. Return its future."""
         if _is_async(callback):
             callback, args, kwargs = callback(*args, **kwargs), (), {}
         task = _Task(callback, new_task(callback, args, kwargs, owner.executor), owner, gate)
-        self._tasks.append(task)
+        self.waiting.append(task)
         return task.future
 
     def run(self) -> bool:
@@ -40,7 +36,7 @@ class Tasks:
         node whose gate is closed are not continued.
         """
         progress = False
-        tasks, self._tasks = self._tasks, []
+        tasks, self.waiting = self.waiting, []
         waiting = []
         try:
             while tasks:
@@ -54,15 +50,15 @@ class Tasks:
                 if not (task.future.done() or task.future.cancelled()):
                     waiting.append(task)
         finally:
-            self._tasks = [*waiting, *tasks, *self._tasks]
+            self.waiting = [*waiting, *tasks, *self.waiting]
         return progress
 
     def cancel(self, owner: Node | None = None) -> None:
         """Cancel all, or those of a node."""
-        for task in self._tasks:
+        for task in self.waiting:
             if owner is None or task.owner is owner:
                 task.future.cancel()
-        self._tasks = [task for task in self._tasks if not task.future.cancelled()]
+        self.waiting = [task for task in self.waiting if not task.future.cancelled()]
 
 
 class _Task:

@@ -136,12 +136,11 @@ class Lockstep:
         )
         self._processes: list[NodeProcess] = []
         self._closing.callback(self._close_processes)
-        self._time.check_processes = self._check_processes
+        self._time.processes = self._processes
         self._extend = guard.extend
         self._messaging = Messaging(scheduler, self._nodes, self._time, self.report)
         self._faults = Faults(scheduler, self._nodes, self.settle)
         self._properties = Properties(scheduler, self._nodes, self.report)
-        self._time.check = self._properties.check
         Lockstep._open = self
         self._time.arrive()
 
@@ -184,10 +183,6 @@ class Lockstep:
         end_all([process.child for process in self._processes])
         for process in self._processes:
             process.close()
-
-    def _check_processes(self) -> bool:
-        # One at a time: what a process still sends may be for another one.
-        return any(process.check() for process in self._processes)
 
     def _check_lost(self) -> None:
         for process in self._processes:
@@ -264,9 +259,12 @@ class Lockstep:
         if node is self.node or node not in self._scheduler.nodes:
             raise LockstepError('the node to remove was not added')
         self._scheduler.killed.add(node)
-        with self._time.watched():
+
+        def remove() -> None:
             self._scheduler.remove(node)
             node.destroy_node()
+
+        self._time.execute(remove)
 
     @property
     def nodes(self) -> list[Node]:
@@ -480,6 +478,7 @@ class Lockstep:
         """
         self._check_open()
         self._properties.require(self, properties)
+        self._time.check = self._properties.check
 
     def finish(self) -> None:
         """Check the properties at the end of a run. Nothing is required any longer afterwards.

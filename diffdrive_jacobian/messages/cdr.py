@@ -47,15 +47,12 @@ SMALLEST = sys.float_info.min
 """Smallest positive normal number. No speed or position is that small but zero."""
 
 
-def integer_warning(what: str, *values: float) -> str | None:
-    """Return a warning if a value is an integer that was assigned to a field of floats, else None."""
-    for value in values:
-        if value and -SMALLEST < value < SMALLEST:
-            return (
-                f'{what} has the value {value:.3g}: was an int assigned to a float field? Assign 1.0 '
-                'instead of 1 (with ROS_PYTHON_CHECK_FIELDS=1 rclpy reports it to the sender)'
-            )
-    return None
+def integer_warning(what: str, value: float) -> str:
+    """Return a warning of a value below `SMALLEST`: an integer that was assigned to a field of floats."""
+    return (
+        f'{what} has the value {value:.3g}: was an int assigned to a float field? Assign 1.0 '
+        'instead of 1 (with ROS_PYTHON_CHECK_FIELDS=1 rclpy reports it to the sender)'
+    )
 
 
 _MAX_LAYOUTS = 16
@@ -382,7 +379,12 @@ _converted_before = lru_cache(maxsize=64)(_converted)
 class Writer:
     """Writes serialized messages that differ from a template in some numbers."""
 
-    def __init__(self, template: Any, fields: Values[str]) -> None:
+    def __init__(
+        self,
+        template: Any,
+        fields: Values[str],
+        numbers: Callable[..., tuple[Any, ...]] = lambda *values: values,
+    ) -> None:
         """Serialize the template.
 
         Args:
@@ -391,6 +393,8 @@ class Writer:
             fields: Paths of the numbers that are written, in the order of the message:
                 `pose.position.x`, `covariance[7]` for an element, `covariance` for all elements of an
                 array or sequence.
+            numbers: Returns these numbers, one for each field or element of a field, given the arguments
+                of a call.
 
         Raises:
             ValueError: A field does not exist, is no number, or is not in the order of the message.
@@ -422,28 +426,22 @@ class Writer:
         ends = list(accumulate(run.numbers for run in runs))
         # Values after the last run are left to it, which refuses them.
         parts = [slice(*pair) for pair in pairwise([0, *ends[:-1], None])]
-        self._first = parts[0]
+        self._numbers = numbers
+        self._first = parts[0].stop
         self._more = list(zip(constants[1:], parts[1:], strict=True))
 
     def __call__(self, *values: Any) -> bytes:
-        """Return the message with these numbers, one for each field or element of a field.
+        """Return the message with the numbers of these values.
 
         Raises:
             MessageError: A number is out of range for its field, or their count is wrong.
         """
+        numbers = self._numbers(*values)
         try:
-            if not self._more:
-                return self._pack(*self._head, *values, *self._tail)
-            if len(self._more) == 1:
-                # Usually a stamp, the names of frames, and numbers.
-                ((constant, part),) = self._more
-                return self._pack(
-                    *self._head, *values[self._first], constant, *values[part], *self._tail
-                )
-            arguments = [*self._head, *values[self._first]]
+            arguments = [*self._head, *numbers[: self._first]]
             for constant, part in self._more:
                 arguments.append(constant)
-                arguments += values[part]
+                arguments += numbers[part]
             return self._pack(*arguments, *self._tail)
         except (struct.error, OverflowError) as error:
             raise MessageError(f'{self._name} cannot be serialized: {error}') from error

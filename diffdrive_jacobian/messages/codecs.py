@@ -63,8 +63,8 @@ class Codec(Generic[V]):
     """Returns the value of these fields. It raises MessageError if they are invalid."""
     written: tuple[str, ...] = ()
     """Paths of the numbers that are written, as `cdr.Writer` takes them."""
-    numbers: Callable[[V], tuple[Any, ...]] = lambda _: ()
-    """Returns these numbers of a value."""
+    numbers: Callable[..., tuple[Any, ...]] = lambda *_: ()
+    """Returns these numbers, given the fields of a value."""
     header: Codec[Any] | None = None
     """What is read and checked before the rest, which may be long."""
 
@@ -88,15 +88,9 @@ class Codec(Generic[V]):
 
         return checked
 
-    def writer(self, template: Any) -> Callable[[V], bytes]:
-        """Return a function that serializes values, with the strings and lengths of a template."""
-        write, numbers = Writer(template, self.written), self.numbers
-        return lambda value: write(*numbers(value))
-
-
-def stamp_of(stamp: int) -> tuple[int, int]:
-    """Return `sec` and `nanosec` of a time (ns)."""
-    return divmod(stamp, NANOSECONDS)
+    def writer(self, template: Any) -> Writer:
+        """Return what serializes values, given their fields, with the strings and lengths of a template."""
+        return Writer(template, self.written, self.numbers)
 
 
 def twist_fields(type_name: str) -> tuple[str, ...]:
@@ -136,17 +130,20 @@ TWIST = Codec(
     twist_fields('geometry_msgs/msg/Twist'),
     lambda *twist: Command(from_twist(*twist)),
     ('linear.x', 'angular.z'),
-    lambda command: command.twist,
+    lambda twist, stamp=0: twist,
 )
 TWIST_STAMPED = Codec(
     'geometry_msgs/msg/TwistStamped',
     (*STAMP, *twist_fields('geometry_msgs/msg/TwistStamped')),
     lambda sec, nanosec, *twist: Command(from_twist(*twist), from_time(sec, nanosec)),
     (*STAMP, 'twist.linear.x', 'twist.angular.z'),
-    lambda command: (*stamp_of(command.stamp), *command.twist),
+    lambda twist, stamp: (*divmod(stamp, NANOSECONDS), *twist),
 )
 
 # --- Poses: odom, ground_truth, start_pose, initialpose
+
+_ZERO_POSE_COVARIANCE = (0.0,) * 9
+_ZERO_TWIST_COVARIANCE = (0.0,) * 4
 
 
 class Motion(NamedTuple):
@@ -160,9 +157,9 @@ class Motion(NamedTuple):
     """`(x, y, theta)` (m, m, rad)."""
     twist: tuple[float, float]
     """`(v, omega)` in the body frame (m/s, rad/s)."""
-    covariance: tuple[float, ...] = (0.0,) * 9
+    covariance: tuple[float, ...] = _ZERO_POSE_COVARIANCE
     """Of x, y, theta, row by row; not checked, see `covariances.from_covariance`."""
-    twist_covariance: tuple[float, ...] = (0.0,) * 4
+    twist_covariance: tuple[float, ...] = _ZERO_TWIST_COVARIANCE
     """Of v and omega, row by row; not checked."""
 
 
@@ -175,7 +172,7 @@ class Place(NamedTuple):
     """Frame of the pose."""
     pose: tuple[float, float, float]
     """`(x, y, theta)` (m, m, rad)."""
-    covariance: tuple[float, ...] = (0.0,) * 9
+    covariance: tuple[float, ...] = _ZERO_POSE_COVARIANCE
     """As of a `Motion`."""
 
 
@@ -215,12 +212,12 @@ ODOMETRY = Codec(
         *('twist.twist.linear.x', 'twist.twist.angular.z'),
         *(f'twist.covariance[{index}]' for index in _FORWARD_AND_YAW),
     ),
-    lambda motion: (
-        *stamp_of(motion.stamp),
-        *_pose_numbers(motion.pose),
-        *motion.covariance,
-        *motion.twist,
-        *motion.twist_covariance,
+    lambda stamp, frame, pose, twist, covariance=_ZERO_POSE_COVARIANCE, twist_covariance=_ZERO_TWIST_COVARIANCE: (
+        *divmod(stamp, NANOSECONDS),
+        *_pose_numbers(pose),
+        *covariance,
+        *twist,
+        *twist_covariance,
     ),
 )
 MOTION = Codec(
@@ -249,7 +246,11 @@ POSE_WITH_COVARIANCE = Codec(
     ),
     _place,
     _WRITTEN_PLACE,
-    lambda place: (*stamp_of(place.stamp), *_pose_numbers(place.pose), *place.covariance),
+    lambda stamp, frame, pose, covariance=_ZERO_POSE_COVARIANCE: (
+        *divmod(stamp, NANOSECONDS),
+        *_pose_numbers(pose),
+        *covariance,
+    ),
 )
 
 # --- Goals: goal_pose, goals, path, goal_status
@@ -325,7 +326,7 @@ POSE = Codec(
     (*STAMP, FRAME, *pose_fields('geometry_msgs/msg/PoseStamped')),
     lambda sec, nanosec, frame, *pose: Route((sec, nanosec), frame, (from_pose(*pose),)),
     (*STAMP, *(f'pose.{field}' for field in _PLANAR_POSE)),
-    lambda route: (*route.stamp, *_pose_numbers(route.poses[0])),
+    lambda stamp, frame, poses, *_: (*stamp, *_pose_numbers(poses[0])),
 )
 GOALS_HEADER = Codec('nav_msgs/msg/Goals', (*STAMP, 'len(goals)'), _at_most(MAX_WAYPOINTS, 'goals'))
 """Stamp and number of poses."""
@@ -411,14 +412,18 @@ JOINT_STATE = Codec(
     (*STAMP, 'name', 'position', 'velocity'),
     lambda sec, nanosec, *values: Wheels(from_time(sec, nanosec), *values),
     (*STAMP, 'position', 'velocity'),
-    lambda wheels: (*stamp_of(wheels.stamp), *wheels.positions, *wheels.velocities),
+    lambda stamp, joints, positions, velocities: (
+        *divmod(stamp, NANOSECONDS),
+        *positions,
+        *velocities,
+    ),
 )
 WHEEL_ARRAY = Codec(
     'std_msgs/msg/Float64MultiArray',
     ('data',),
     WheelArray,
     ('data',),
-    lambda wheels: wheels.velocities,
+    lambda velocities, stamp=0: velocities,
 )
 
 # --- Events: parameter_events, fault_events

@@ -32,7 +32,6 @@ from diffdrive_jacobian.messages.codecs import (
     POSE,
     TWIST,
     TWIST_STAMPED,
-    Command,
     Route,
 )
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_WAYPOINTS, MessageError
@@ -389,8 +388,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         goal, now = self._goal, self.now()
         try:
             pose = messages.from_pose(*values)
-            underway = self._driving or (goal is not None and goal.executing)
-            if underway and frame != self._odom_frame:
+            if frame != self._odom_frame and (
+                self._driving or (goal is not None and goal.executing)
+            ):
                 raise MessageError(
                     f"it must stay in frame '{printable(self._odom_frame)}', got '{printable(frame)}'"
                 )
@@ -432,7 +432,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._publish_command(0.0, 0.0)
             self._end(GoalStatus.STATUS_SUCCEEDED, 'reached')
             return
-        self._publish_command(*command)
+        self._publish_command(*command, now)
 
     def _step(
         self, goal: Goal, pose: tuple[float, float, float], now: int
@@ -449,7 +449,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             if command is not None:
                 return command
             self._leave_path(goal, goal.path)
-        goal.waypoints, command = goal.waypoints.follow(
+        goal.waypoints, command = goal.waypoints.step(
             pose, self._law, self._arrival, self.parameters.kp, self._twist
         )
         return command
@@ -468,11 +468,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     def _limited(self, v: float, omega: float) -> tuple[float, float]:
         """Return a command within the limits, without whole turns between two messages."""
         # Without wheels in the limits the geometry of the wheels does not matter.
-        v, omega = scaled_to_limits.formula(v, omega, *self._limits.all(), 1.0, 1.0)
+        v, omega = scaled_to_limits.floats(v, omega, *self._limit_values, 1.0, 1.0)
         if abs(omega) > LARGEST_TURN * self._rate:
             # The other direction may be forbidden.
             omega = without_whole_turns(omega, self._rate)
-            v, omega = scaled_to_limits.formula(v, omega, *self._limits.all(), 1.0, 1.0)
+            v, omega = scaled_to_limits.floats(v, omega, *self._limit_values, 1.0, 1.0)
         return v, omega
 
     def _begin(self, goal: Goal, pose: tuple[float, float, float]) -> bool:
@@ -534,15 +534,18 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 break
         return distance, turn
 
-    def _publish_command(self, v: float, omega: float) -> None:
-        now = self.now()
-        while len(self._commands) > 1 and self._commands[1][0] <= now - self._actuators.delay:
-            self._commands.popleft()
-        self._commands.append((now, v, omega))
-        self._driving = (v, omega) != (0.0, 0.0)
-        command = self._serialized(Command((v, omega), self.now()))
-        self._others.sent(command)
-        self._cmd_vel.publish(command)
+    def _publish_command(self, v: float, omega: float, now: int | None = None) -> None:
+        """Publish a command at a time (ns); None: now."""
+        now = self.now() if now is None else now
+        commands, delay = self._commands, self._actuators.delay
+        while len(commands) > 1 and commands[1][0] <= now - delay:
+            commands.popleft()
+        commands.append((now, v, omega))
+        twist = v, omega
+        self._driving = twist != STANDSTILL
+        data = self._serialized(twist, now)
+        self._others.sent(data)
+        self._cmd_vel.publish(data)
 
     def _on_other_driver(self, names: str) -> None:
         """Cancel the goal: whoever drives by hand takes over."""
@@ -591,6 +594,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._path_law, self._path_settings = path_law, parameters.path_settings()
         # Far from the goal a law may return more than what counts as a plausible command.
         self._limits = parameters.limits()
+        self._limit_values = self._limits.all()
         self._arrival = parameters.arrival()
         self._actuators = parameters.actuators()
         if self._limits.max_v == 0.0:

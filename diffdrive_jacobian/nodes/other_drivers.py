@@ -45,6 +45,8 @@ class OtherDrivers:
         self._subscribed = False
         # Serialized, as they arrive again.
         self._sent: deque[bytes] = deque(maxlen=REMEMBERED)
+        self.sent = self._sent.append
+        """Remember a serialized command of the node itself."""
         kind = publisher.msg_type
         codec = TWIST_STAMPED if kind.__name__ == 'TwistStamped' else TWIST
         self._read = codec.reader(kind, deserialize_message)
@@ -63,10 +65,6 @@ class OtherDrivers:
     def stop(self) -> None:
         """Ignore other drivers from now on."""
         self._active = False
-
-    def sent(self, command: bytes) -> None:
-        """Remember a command of the node itself."""
-        self._sent.append(command)
 
     def search(self, now: int) -> None:
         """Search for other drivers if that is due at a time of the node (ns).

@@ -35,8 +35,6 @@ from diffdrive_jacobian.messages.codecs import (
     TWIST,
     TWIST_STAMPED,
     Command,
-    Motion,
-    Place,
     Wheels,
 )
 from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
@@ -102,24 +100,25 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         )
         self.provide(Trigger, 'reset_odometry', self._on_reset)
         self._timer = self.create_timer(1.0 / self.parameters.publish_rate, self._on_tick)
+        self._first_clock: JumpHandle | None = None
         self._jumps = self._watch_jumps()
         self._advance()
         self.announce(subscribed=[source], publishing=['odom', *['ground_truth'] * drifts])
 
     # --- Time
 
-    def _watch_jumps(self) -> list[JumpHandle]:
+    def _watch_jumps(self) -> JumpHandle:
         """Advance the robot when simulated time starts or time goes back, before the next message."""
         clock = self.get_clock()
         back = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1))
-        handles = [clock.create_jump_callback(back, post_callback=lambda _: self._advance())]
         if self.now() == 0:
+            # It stays registered until the next tick: rcl skips a callback if another one is removed
+            # while they are called.
             first = JumpThreshold(min_forward=Duration(nanoseconds=1), min_backward=None)
-            handles.append(clock.create_jump_callback(first, post_callback=self._on_first_clock))
-        return handles
+            self._first_clock = clock.create_jump_callback(first, post_callback=self._on_first_clock)
+        return clock.create_jump_callback(back, post_callback=lambda _: self._advance())
 
     def _on_first_clock(self, _: TimeJump) -> None:
-        # It stays registered: rcl skips a callback if another one is removed while they are called.
         if self._robot is None:
             self._advance()
 
@@ -161,31 +160,35 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     def _publish_start(self, robot: Robot) -> None:
         """Publish the pose and the time at which the odometry starts."""
         frame = self.parameters.odom_frame_id
-        place = Place(robot.stamp, frame, robot.pose_tuple, robot.covariance_tuple)
-        self._start_pose.publish(self._serialized_start(place))
+        data = self._serialized_start(robot.stamp, frame, robot.pose_tuple, robot.covariance_tuple)
+        self._start_pose.publish(data)
 
     def _on_tick(self) -> None:
         advanced = self._advance()
         if advanced is None:
             return
+        if self._first_clock is not None:
+            self._first_clock.unregister()
+            self._first_clock = None
         now, robot = advanced
         truth = robot.at(now)
-        state = self.defects.reported(truth)
-        motion = Motion(
-            state.stamp,
-            self.parameters.odom_frame_id,
+        state = truth if self.defects.encoders is None else self.defects.reported(truth)
+        parameters = self.parameters
+        data = self._serialized_odometry(
+            now,
+            parameters.odom_frame_id,
             state.pose_tuple,
             state.twist,
             state.covariance_tuple,
             state.twist_covariance_tuple(self._period),
         )
-        self._odom.publish(self._serialized_odometry(motion))
-        wheels = Wheels.of(now, self.parameters.wheel_names, state.wheel_speeds, state.wheel_angles)
-        self._joint_states.publish(self._serialized_joints(wheels))
+        self._odom.publish(data)
+        wheels = Wheels.of(now, parameters.wheel_names, state.wheel_speeds, state.wheel_angles)
+        self._joint_states.publish(self._serialized_joints(*wheels))
         if self._ground_truth is not None:
-            frame = self.parameters.ground_truth_frame_id
-            true = Motion(truth.stamp, frame, truth.true_pose_tuple, truth.true_twist)
-            self._ground_truth.publish(self._serialized_truth(true))
+            frame = parameters.ground_truth_frame_id
+            data = self._serialized_truth(now, frame, truth.true_pose_tuple, truth.true_twist)
+            self._ground_truth.publish(data)
         if self._transforms is not None:
             messages.set_time(self._odometry.header.stamp, now)
             messages.set_pose(self._odometry.pose.pose, state.pose)
@@ -219,7 +222,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _publish_applied(self, robot: Robot) -> None:
         """Publish the twist that the robot is to reach, with the time from which it follows it."""
-        self._applied.publish(self._serialized_command(Command(robot.target, robot.stamp)))
+        self._applied.publish(self._serialized_command(robot.target, robot.stamp))
 
     # --- Pose
 
@@ -351,7 +354,8 @@ class RobotDefects:
         """Start with a robot that is in order."""
         self._node = node
         self._changes: list[Callable[[RobotModel], RobotModel]] = []
-        self._encoders: Encoders | None = None
+        self.encoders: Encoders | None = None
+        """The encoders at their last reading; None: the angles are exact."""
         self._has_truth = False
 
     def model(self, nominal: RobotModel) -> RobotModel:
@@ -412,29 +416,29 @@ class RobotDefects:
         """
         self._know_truth()
         now, robot = self._node._present()
-        encoders, robot = self._encoders, robot.at(now)
+        encoders, robot = self.encoders, robot.at(now)
         if per_revolution is not None:
-            self._encoders = Encoders.at(robot, per_revolution)
+            self.encoders = Encoders.at(robot, per_revolution)
         elif encoders is not None:
-            self._encoders = None
+            self.encoders = None
             pose = encoders.read(robot).pose
             self._node._place(robot.placed(pose, robot.covariance, now, odometry_only=True))
 
     def reported(self, robot: Robot) -> Robot:
         """Read the encoders, and return the robot as they report it."""
-        if self._encoders is None:
+        if self.encoders is None:
             return robot
-        self._encoders = self._encoders.read(robot)
-        return self._encoders.reported(robot)
+        self.encoders = self.encoders.read(robot)
+        return self.encoders.reported(robot)
 
     def odometry_pose(self, robot: Robot) -> NDArray[np.float64]:
         """Return `[x, y, theta]` of the odometry, shape (3,), by the last reading of encoders."""
-        return np.array(robot.pose_tuple if self._encoders is None else self._encoders.pose)
+        return np.array(robot.pose_tuple if self.encoders is None else self.encoders.pose)
 
     def placed(self, robot: Robot) -> None:
         """Start the odometry again at the pose of the robot."""
-        if self._encoders is not None:
-            self._encoders = self._encoders.read(robot).placed(robot.pose_tuple)
+        if self.encoders is not None:
+            self.encoders = self.encoders.read(robot).placed(robot.pose_tuple)
 
     def _know_truth(self) -> None:
         """Compute the true pose besides that of the odometry from now on."""

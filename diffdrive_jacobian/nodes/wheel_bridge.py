@@ -158,7 +158,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         speeds, names = [0.0, 0.0], parameters.wheel_names
         if self._joint_command.msg_type is JointState:
             joints = JOINT_STATE.writer(JointState(name=[*names], velocity=speeds))
-            self._serialized = lambda speeds, stamp: joints(Wheels.of(stamp, names, speeds))
+            self._serialized = lambda speeds, stamp: joints(*Wheels.of(stamp, names, speeds))
         else:
             array = WHEEL_ARRAY.writer(Float64MultiArray(data=speeds))
-            self._serialized = lambda speeds, _: array(WheelArray.of(speeds))
+            self._serialized = lambda speeds, _: array(*WheelArray.of(speeds))

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from operator import mul
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -99,7 +100,48 @@ def where(condition: Any, x: Any, y: Any) -> Any:
     return np.where(condition, x, y)
 
 
+def all_finite(x: Any) -> bool:
+    """Return whether a float, or each entry of an array, is finite."""
+    return math.isfinite(x) if type(x) is float else bool(np.isfinite(x).all())
+
+
 def product(A: Sequence[Sequence[Any]], B: Sequence[Sequence[Any]]) -> list[list[Any]]:
     """Multiply two matrices that are lists of rows."""
     columns = list(zip(*B, strict=True))
     return [[sum(map(mul, row, column)) for column in columns] for row in A]
+
+
+# --- One robot, for every message
+
+OF_FLOATS: dict[Any, Callable[..., Any]] = {
+    sin: math.sin,
+    cos: math.cos,
+    atan2: math.atan2,
+    sqrt: math.sqrt,
+    maximum: max,
+    minimum: min,
+    all_finite: math.isfinite,
+    where: lambda condition, x, y: x if condition else y,
+}
+"""What the functions above are for floats."""
+
+
+def for_floats(body: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of the same body that takes floats only, and is three times as fast.
+
+    Its elementary functions are those of `math`, and the equations that it calls are their `floats`.
+    """
+    names = body.__globals__
+    of_floats = {name: OF_FLOATS[of] for name, of in names.items() if _has_floats(of)}
+    code = body.__code__
+    attributes = tuple('floats' if name == 'formula' else name for name in code.co_names)
+    made = FunctionType(code.replace(co_names=attributes), {**names, **of_floats}, body.__name__)
+    made.__defaults__, made.__kwdefaults__ = body.__defaults__, body.__kwdefaults__
+    return made
+
+
+def _has_floats(value: Any) -> bool:
+    return type(value) is FunctionType and value in OF_FLOATS
+
+
+OF_FLOATS |= {composed: for_floats(composed) for composed in (hypot, sinc)}

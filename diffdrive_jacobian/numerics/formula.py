@@ -18,6 +18,7 @@ have the shape (n, ...), matrices (m, n, ...), and `(a, b), (c, d) = J`. Results
 
 Bad arguments raise a ValueError that names the argument, and so does a result that overflows. The body
 without these checks is `formula` of the decorated function: it is for callers whose numbers are checked.
+The same body for floats alone is `floats`: it is for what runs for every message.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.numerics.checks import FLOAT64, finite, leading, shaped
+from diffdrive_jacobian.numerics.elementary import for_floats
 
 __all__ = ['formula']
 
@@ -60,6 +62,8 @@ class Formula(Protocol[P, R]):
     __name__: str
     formula: Callable[..., Any]
     """The equation without checks."""
+    floats: Callable[..., Any]
+    """The equation without checks, for floats."""
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Check the arguments and evaluate the equation."""
@@ -142,7 +146,12 @@ def formula(signature: str, **checks: Check) -> _Decorator:
                 # Floats raise these where arrays become infinite: `x**2`, `sin(inf)`, `1 / 0`.
                 raise ValueError(f'{given} must give a finite result, but it overflows') from None
 
-        checked.formula = body  # type: ignore[attr-defined]
+        def first(*args: Any, **kwargs: Any) -> Any:
+            # Not before: the body may call what is defined after it.
+            checked.floats = for_floats(body)  # type: ignore[attr-defined]
+            return checked.floats(*args, **kwargs)  # type: ignore[attr-defined]
+
+        checked.formula, checked.floats = body, first  # type: ignore[attr-defined]
         return checked
 
     return cast('_Decorator', decorate)

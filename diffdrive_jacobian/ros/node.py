@@ -25,7 +25,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 
-from diffdrive_jacobian.messages.cdr import DecodingError, integer_warning
+from diffdrive_jacobian.messages.cdr import SMALLEST, DecodingError, integer_warning
 from diffdrive_jacobian.messages.codecs import Codec
 from diffdrive_jacobian.messages.names import type_name
 from diffdrive_jacobian.parameters.declaration import (
@@ -200,8 +200,11 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     def warn_of_integers(self, what: str, *values: float) -> None:
         """Warn, throttled, if a value of what is named is an integer assigned to a field of floats."""
-        if warning := integer_warning(what, *values):
-            self.get_logger().warning(warning, throttle_duration_sec=THROTTLE)
+        for value in values:
+            if value and -SMALLEST < value < SMALLEST:
+                warning = integer_warning(what, value)
+                self.get_logger().warning(warning, throttle_duration_sec=THROTTLE)
+                return
 
     def log_event_info(self, event: str, text: str) -> None:
         """Log a line at level info, of each kind of event EVENT_BURST, then one per EVENT_PERIOD."""

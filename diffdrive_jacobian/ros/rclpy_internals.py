@@ -13,7 +13,7 @@ from __future__ import annotations
 import ctypes
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import redirect_stderr
 from functools import cache, wraps
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -245,25 +245,31 @@ def timer_handle(timer: Timer) -> TimerHandle:
 class SimulatedClock:
     """The clock of a node whose time is set directly, instead of by a message on /clock.
 
-    Does what `TimeSource.clock_callback` does. Relies on `Node._time_source`, `TimeSource._clock_sub`,
-    `TimeSource._last_time_set` and `TimeSource._associated_clocks`, and on the handles of `ROSClock` and
-    `Time`, with which to set the time takes half as long.
+    Relies on `Node._time_source`, `TimeSource._clock_sub` and `TimeSource._associated_clocks`, and on
+    `ROSClock.handle`, with which to set the time takes half as long.
     """
 
-    __slots__ = ('_source', 'subscription')
+    __slots__ = ('overrides', 'source', 'subscription')
 
     def __init__(self, node: Node) -> None:
         """Take the clock of a node."""
-        self._source = node._time_source
-        self.subscription: Subscription | None = self._source._clock_sub
+        self.source = node._time_source
+        self.subscription: Subscription | None = self.source._clock_sub
         """Subscription that would receive the time. None: the clock shows wall time."""
+        self.overrides = [clock.handle.set_ros_time_override for clock in self.source._associated_clocks]
 
-    def set(self, now: Time) -> None:
-        """Set the time. Callbacks for jumps are called."""
-        source = self._source
-        source._last_time_set = now
-        for clock in source._associated_clocks:
-            clock.handle.set_ros_time_override(now._time_handle)
+
+def set_clocks(clocks: Iterable[SimulatedClock], now: Time) -> None:
+    """Set the time of clocks. Callbacks for jumps are called.
+
+    Does what `TimeSource.clock_callback` does. Relies on `TimeSource._last_time_set` and
+    `Time._time_handle`.
+    """
+    handle = now._time_handle
+    for clock in clocks:
+        clock.source._last_time_set = now
+        for override in clock.overrides:
+            override(handle)
 
 
 # --- Messages
@@ -282,12 +288,28 @@ def message_taker(
     return handle.take_message, lambda: handle.__exit__(None, None, None)
 
 
-def receives_info(subscription: Subscription) -> bool:
-    """Return whether the callback of a subscription receives a message and its info.
+def message_receiver(subscription: Subscription) -> Callable[[tuple[Any, dict[str, Any]]], Any]:
+    """Return a function that calls the callback of a subscription with what `message_taker` takes.
 
-    Relies on `Subscription._callback_type`.
+    The callback may be replaced. Relies on `Subscription._callback` and `Subscription._callback_type`.
     """
-    return bool(subscription._callback_type is Subscription.CallbackType.WithMessageInfo)
+    with_info = Subscription.CallbackType.WithMessageInfo
+
+    def receive(taken: tuple[Any, dict[str, Any]]) -> Any:
+        if subscription._callback_type is with_info:
+            return subscription._callback(*taken)
+        return subscription._callback(taken[0])
+
+    return receive
+
+
+def subscription_counter(publisher: Publisher) -> Callable[[], int]:
+    """Return a function that returns how many subscriptions a publisher has.
+
+    Relies on `Publisher.handle.get_subscription_count`, which needs no lock within one thread.
+    """
+    count: Callable[[], int] = publisher.handle.get_subscription_count
+    return count
 
 
 def refuse_init(context: Context, refuse: Callable[..., None]) -> None:
@@ -468,26 +490,17 @@ def lost_messages(subscription: Subscription) -> int:
     return count
 
 
-def with_message_info(
-    callback: Callable[[bytes, Mapping[str, Any]], None],
-) -> Callable[..., None]:
-    """Return a callback for a raw subscription that receives the message and its info.
+def request_message_info(callback: Callable[..., None]) -> None:
+    """Let a callback of a subscription receive the message and its info.
 
-    Relies on `Subscription.callback` deciding by the signature whether the info is passed, and on the
-    executors: the SingleThreadedExecutor passes two arguments, the EventsExecutor of Jazzy one tuple.
-    The times in the info are right on the SingleThreadedExecutor only.
+    The SingleThreadedExecutor passes them as two arguments, the EventsExecutor of Jazzy as one tuple: the
+    callback must accept both. The times in the info are right on the SingleThreadedExecutor only.
+    Relies on `Subscription.callback` deciding by the signature whether the info is passed.
     """
-
-    def received(data: Any, info: Mapping[str, Any] | None = None) -> None:
-        if info is None:
-            data, info = data
-        callback(data, info)
-
     kind = inspect.Parameter.POSITIONAL_ONLY
     parameters = [inspect.Parameter(name, kind) for name in ('data', 'info')]
-    vars(received)['__signature__'] = inspect.Signature(parameters)
-    vars(received)['any_executor'] = True
-    return received
+    vars(callback)['__signature__'] = inspect.Signature(parameters)
+    vars(callback)['any_executor'] = True
 
 
 # --- Executors
@@ -532,7 +545,7 @@ def longest_queue(node: Node) -> int:
 def requires_wait_set(node: Node) -> bool:
     """Return whether a node has callbacks that the EventsExecutor of Jazzy does not support.
 
-    It passes a message and its info as one argument, which only callbacks of `with_message_info` take,
+    It passes a message and its info as one argument, which only those of `request_message_info` accept,
     does not await coroutines of subscriptions and services, and raises an exception for guard
     conditions.
     Relies on `Subscription._callback_type`.

@@ -14,7 +14,7 @@ from diffdrive_jacobian.messages.codecs import GOALS_HEADER, PATH_HEADER, Codec
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.structure import PLAIN
 from diffdrive_jacobian.ros.graph_faults import Interleaving
-from diffdrive_jacobian.ros.rclpy_internals import with_message_info
+from diffdrive_jacobian.ros.rclpy_internals import request_message_info
 
 V = TypeVar('V')
 
@@ -77,7 +77,12 @@ def decoding(
     """
     read = reader(message_type, fields)
 
-    def decode(data: bytes) -> None:
+    def decode(data: Any, info: Mapping[str, Any] | None = None) -> None:
+        if numbers is not None:
+            # The EventsExecutor passes one tuple.
+            data, info = data if info is None else (data, info)
+            # None where the middleware does not number messages.
+            numbers.number = info.get('publication_sequence_number')
         try:
             values = read(data)
         except DecodingError as error:
@@ -85,18 +90,11 @@ def decoding(
             return
         callback(*values)
 
-    chosen: Callable[..., None] = decode
     if numbers is not None:
-
-        def decode_numbered(data: bytes, info: Mapping[str, Any]) -> None:
-            # None where the middleware does not number messages.
-            numbers.number = info.get('publication_sequence_number')
-            decode(data)
-
-        chosen = with_message_info(decode_numbered)
+        request_message_info(decode)
     # Reports name a callback.
-    chosen.__qualname__ = getattr(callback, '__qualname__', chosen.__qualname__)
-    return chosen
+    decode.__qualname__ = getattr(callback, '__qualname__', decode.__qualname__)
+    return decode
 
 
 _read_header = {

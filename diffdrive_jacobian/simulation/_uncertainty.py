@@ -12,10 +12,11 @@ changes its direction. Source: doc/mathematics.md, "Acceleration, lag and delay"
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from math import cos, exp, expm1, isfinite, sin
 from operator import mul
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from diffdrive_jacobian.simulation.exact_moments import (
     Entries,
@@ -24,6 +25,7 @@ from diffdrive_jacobian.simulation.exact_moments import (
     composed,
     propagated_moments,
 )
+from diffdrive_jacobian.simulation.odometry_noise import spectral_densities
 from diffdrive_jacobian.simulation.speeds import Course, Piece, sign_changes, travelled
 
 MAX_NOISE = 0.25
@@ -69,7 +71,8 @@ def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> 
     """Return the moments after a step in which no wheel changes its direction."""
     T = piece.seconds
     if piece.constant:
-        return propagated_moments(moments, theta, piece.twist(0.0), T, L, k)
+        twist = piece.twist(0.0)
+        return propagated_moments(moments, theta, twist, spectral_densities(*twist, L, k), T)
     v, omega = piece.twist(T / 2.0)
     right = math.copysign(k, v + omega * L / 2.0)
     left = math.copysign(k, v - omega * L / 2.0)
@@ -127,9 +130,8 @@ def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> 
     return composed(moments, cosine, sine, g.real, g.imag, m, central(noise, m) if m else None)
 
 
-Arc: TypeAlias = tuple[float, tuple[float, float] | Piece, float, float, float]
-"""Heading at the start (rad), twist (m/s, rad/s), or how it changes with time, duration (s), wheel
-separation (m), k (m)."""
+Propagation: TypeAlias = Callable[..., Entries | None]
+"""`propagated_moments` or `moments_along`."""
 MAX_PENDING = 64
 """Number of arcs that are kept at most. One more evaluates those before it, so memory is bounded."""
 
@@ -142,16 +144,21 @@ class Uncertainty:
     def __init__(self, moments: Entries) -> None:
         """Start from given moments."""
         self._moments: Entries | None = moments
-        self._pending: tuple[Uncertainty, Arc] | None = None
+        self._pending: tuple[Uncertainty, Propagation, tuple[Any, ...]] | None = None
         self._number = 0
 
-    def after(self, arc: Arc) -> Uncertainty:
-        """Return the uncertainty at the end of an arc, without evaluating it."""
+    def after(self, propagated: Propagation, *arc: Any) -> Uncertainty:
+        """Return the uncertainty at the end of an arc, without evaluating it.
+
+        Args:
+            propagated: Returns the moments at the end of an arc.
+            arc: Its arguments after the moments at the start.
+        """
         if self._number >= MAX_PENDING:
             self._evaluate()
         later = object.__new__(Uncertainty)
         later._moments = None
-        later._pending = self, arc
+        later._pending = self, propagated, arc
         later._number = self._number + 1
         return later
 
@@ -173,14 +180,10 @@ class Uncertainty:
             waiting.append((here, *pending))
             here = pending[0]
             pending = here._pending
-        for here, before, arc in reversed(waiting):
+        for here, before, propagated, arc in reversed(waiting):
             if before._moments is not None:
                 # After an overflow there is none.
-                theta, twist, dt, L, k = arc
-                if isinstance(twist, Piece):
-                    here._moments = moments_along(before._moments, theta, twist, dt, L, k)
-                else:
-                    here._moments = propagated_moments(before._moments, theta, twist, dt, L, k)
+                here._moments = propagated(before._moments, *arc)
             here._number = 0
             # Last, because then the moments count.
             here._pending = None

@@ -237,7 +237,8 @@ def propagate_moments(
     dt, L = number('dt', dt, not_negative), number('L', L, positive)
     k = number('wheel_travel_variance', wheel_travel_variance, not_negative)
     entries = tuple(numbers('moments', moments, 12))
-    propagated = propagated_moments(entries, theta, (v, omega), dt, L, k)
+    densities = spectral_densities(v, omega, L, k)
+    propagated = propagated_moments(entries, theta, (v, omega), densities, dt)
     if propagated is None:
         raise ValueError(
             'moments, pose, twist, dt, L and wheel_travel_variance must give a finite result, '
@@ -250,14 +251,15 @@ def propagated_moments(
     moments: Entries,
     theta: float,
     twist: tuple[float, float],
+    densities: tuple[float, float, float],
     dt: float,
-    L: float,
-    wheel_travel_variance: float,
 ) -> Entries | None:
-    """Return `propagate_moments` of values that were checked; None: they overflow."""
-    v, omega = twist
+    """Return `propagate_moments` of values that were checked, and of the `spectral_densities` of the twist.
+
+    None: they overflow.
+    """
+    (v, omega), (vv, vw, ww) = twist, densities
     try:
-        vv, vw, ww = spectral_densities(v, omega, L, wheel_travel_variance)
         alpha, turn, nu, beta, m = v * dt, omega * dt, vv * dt, vw * dt, ww * dt / 2.0
         if m <= SHORT_NOISE and -SHORT_TURN <= turn <= SHORT_TURN:
             # Nearly every arc of a robot: all in the frame of the chord.

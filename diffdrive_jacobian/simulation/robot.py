@@ -14,8 +14,9 @@ Source: doc/mathematics.md, "Motion".
 
 from __future__ import annotations
 
-from math import isfinite
-from typing import TypeAlias
+from math import inf, isfinite
+from operator import attrgetter
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,13 +31,13 @@ from diffdrive_jacobian.numerics.checks import (
     read_only,
 )
 from diffdrive_jacobian.numerics.fields import instance
-from diffdrive_jacobian.simulation._uncertainty import Uncertainty
+from diffdrive_jacobian.simulation._uncertainty import Uncertainty, moments_along
 from diffdrive_jacobian.simulation.actuators import STANDSTILL as STANDSTILL
 from diffdrive_jacobian.simulation.actuators import Drive, Speeds
-from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian
-from diffdrive_jacobian.simulation.odometry_noise import twist_covariance
+from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian, propagated_moments
+from diffdrive_jacobian.simulation.odometry_noise import spectral_densities, twist_covariance
 from diffdrive_jacobian.simulation.robot_model import RobotModel as RobotModel
-from diffdrive_jacobian.simulation.robot_model import pair
+from diffdrive_jacobian.simulation.robot_model import Steady, pair
 from diffdrive_jacobian.simulation.slip import Truth
 from diffdrive_jacobian.simulation.speeds import Piece, Pose, Twist, arc_end, displaced
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -44,6 +45,11 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 _CERTAIN = read_only(np.zeros((3, 3)))
 _State: TypeAlias = tuple[Pose, Speeds, Uncertainty, Truth | None]
 """Pose, wheel angles, uncertainty and truth at a time. Truth None: the pose is the true one."""
+
+
+def _field(name: str, doc: str) -> Any:
+    """Return a read-only property, without the cost of a function."""
+    return property(attrgetter(name), doc=doc)
 
 
 class Robot:
@@ -54,9 +60,20 @@ class Robot:
             and positive semidefinite, or a time is not an integer.
     """
 
+    _model: RobotModel
+    _stamp: int
+    _state: _State
+    _command: Twist
+    _twist: Twist
+    _commanded_at: int | None
+    _expiry: int | None
+    _drive: Drive | None
+    _steady: Steady | None
+    _ahead: tuple[int, _State] | None
+    _knot: tuple[float, _State] | None
     __slots__ = (
         *('_ahead', '_command', '_commanded_at', '_drive', '_expiry'),
-        *('_knot', '_model', '_stamp', '_state', '_twist'),
+        *('_knot', '_model', '_stamp', '_state', '_steady', '_twist'),
     )
 
     def __init__(
@@ -71,7 +88,7 @@ class Robot:
         twist: ArrayLike = STANDSTILL,
         commanded_at: int | None = None,
     ) -> None:
-        """Check every value. The methods below construct their results without these checks.
+        """Check every value. The methods below do not check again what they return.
 
         Args:
             model: The parameters.
@@ -90,31 +107,9 @@ class Robot:
         commanded, applied = pair('command', command), pair('twist', twist)
         if commanded_at is not None:
             commanded_at = nanoseconds('commanded_at', commanded_at)
-        self._set(model, stamp, state, commanded, applied, commanded_at)
-
-    def _set(
-        self,
-        model: RobotModel,
-        stamp: int,
-        state: _State,
-        command: Twist,
-        twist: Twist,
-        commanded_at: int | None = None,
-        drive: Drive | None = None,
-    ) -> None:
-        self._model, self._stamp, self._state = model, stamp, state
-        self._command, self._twist, self._commanded_at = command, twist, commanded_at
-        self._expiry: int | None = None
-        if commanded_at is not None and model.command_timeout:
-            # If the timeout was shortened, it expires now, not in the past.
-            expiry = commanded_at + model.command_timeout
-            self._expiry = expiry if expiry > stamp else stamp
-        # None: the twist is held until the next event.
-        self._drive = drive
-        # The last state that was computed from this one, because often the same one is needed next.
-        self._ahead: tuple[int, _State] | None = None
-        # Where the last state that was computed along the drive begins (s), and the state there.
-        self._knot: tuple[float, _State] | None = None
+        made = _robot(model, stamp, state, commanded, applied, commanded_at)
+        for name in self.__slots__:
+            setattr(self, name, getattr(made, name))
 
     def __repr__(self) -> str:
         """Return a constructor call with the values."""
@@ -130,15 +125,19 @@ class Robot:
         )
         return f'Robot({", ".join(f"{name}={getattr(self, name)!r}" for name in names)})'
 
-    @property
-    def model(self) -> RobotModel:
-        """The parameters."""
-        return self._model
-
-    @property
-    def stamp(self) -> int:
-        """Time of this state (ns)."""
-        return self._stamp
+    model: RobotModel = _field('_model', 'The parameters.')
+    stamp: int = _field('_stamp', 'Time of this state (ns).')
+    command: Twist = _field('_command', 'The last commanded twist, `(v, omega)`.')
+    commanded_at: int | None = _field(
+        '_commanded_at', 'Time at which the command took effect (ns); None: it is zero.'
+    )
+    target: Twist = _field(
+        '_twist', 'The twist to reach: the command after saturation, as far as the motors reach it.'
+    )
+    expiry: int | None = _field(
+        '_expiry',
+        'Time at which the timeout stops the robot (ns); None: it is not moving, or has no timeout.',
+    )
 
     @property
     def pose(self) -> NDArray[np.float64]:
@@ -188,36 +187,16 @@ class Robot:
         return self._state[1]
 
     @property
-    def command(self) -> Twist:
-        """The last commanded twist, `(v, omega)`."""
-        return self._command
-
-    @property
     def twist(self) -> Twist:
         """The twist `(v, omega)` of the odometry at this time."""
         drive = self._drive
         return self._twist if drive is None else drive.motion.twist(drive.motion.seconds(self._stamp))
 
     @property
-    def target(self) -> Twist:
-        """The twist to reach: the command after saturation, as far as the motors reach it."""
-        return self._twist
-
-    @property
     def settles_at(self) -> int:
         """Time from which on the twist is constant without a further event (ns)."""
         drive = self._drive
         return self._stamp if drive is None else max(self._stamp, drive.motion.settled_at)
-
-    @property
-    def commanded_at(self) -> int | None:
-        """Time at which the command took effect (ns); None: it is zero."""
-        return self._commanded_at
-
-    @property
-    def expiry(self) -> int | None:
-        """Time at which the timeout stops the robot (ns); None: it is not moving, or has no timeout."""
-        return self._expiry
 
     @property
     def true_pose_tuple(self) -> Pose:
@@ -244,7 +223,13 @@ class Robot:
     @property
     def wheel_speeds(self) -> Speeds:
         """`(omega_R, omega_L)` (rad/s), by the inverse wheel Jacobian."""
+        if self._drive is None:
+            return (self._steady or self._find_steady()).wheel_speeds
         return self._model.wheel_speeds(*self.twist)
+
+    def _find_steady(self) -> Steady:
+        self._steady = steady = self._model.steady(self._twist)
+        return steady
 
     def twist_covariance(self, interval: float) -> NDArray[np.float64]:
         """Compute the covariance of the twist as measured over an interval (s), shape (2, 2).
@@ -260,12 +245,17 @@ class Robot:
         Raises:
             ValueError: As `twist_covariance`.
         """
-        L, k = self._model.wheel_separation, self._model.wheel_travel_variance
-        interval = number('interval', interval, positive)
-        (vv, vw), (wv, ww) = twist_covariance.formula(self.twist, L, k, interval)
+        if not (type(interval) is float and 0.0 < interval < inf):
+            interval = number('interval', interval, positive)
+        if self._drive is None:
+            vv, vw, ww = (self._steady or self._find_steady()).densities
+            vv, vw, ww = vv / interval, vw / interval, ww / interval
+        else:
+            L, k = self._model.wheel_separation, self._model.wheel_travel_variance
+            (vv, vw), (_, ww) = twist_covariance.floats(self.twist, L, k, interval)
         if not isfinite(vv + abs(vw) + ww):
             raise ValueError('twist and interval must give a finite result, but it overflows')
-        return vv, vw, wv, ww
+        return vv, vw, vw, ww
 
     def at(self, stamp: int) -> Robot:
         """Advance to a time (ns), through the timeout if it expires before.
@@ -283,11 +273,11 @@ class Robot:
         Raises:
             ValueError: The command has another shape or is not finite; or as `at`.
         """
-        v, omega = pair('command', command)
-        twist = self._model.limited((v, omega))
+        command, model = pair('command', command), self._model
+        twist = command if model.limits.unlimited else model.limited(command)
         stamp, robot, state = self._advanced(stamp)
-        commanded_at = None if v == omega == 0.0 else stamp
-        return robot._following(self._model, stamp, state, (v, omega), twist, commanded_at)
+        commanded_at = None if command == STANDSTILL else stamp
+        return robot._following(model, stamp, state, command, twist, commanded_at)
 
     def placed(
         self, pose: ArrayLike, covariance: ArrayLike, stamp: int, *, odometry_only: bool = False
@@ -382,8 +372,10 @@ class Robot:
 
     def _with(self, stamp: int, state: _State) -> Robot:
         """Return the robot in another state, with the same motion."""
-        command, twist = self._command, self._twist
-        return _robot(self._model, stamp, state, command, twist, self._commanded_at, self._drive)
+        command, twist, steady = self._command, self._twist, self._steady
+        return _robot(
+            self._model, stamp, state, command, twist, self._commanded_at, self._drive, steady
+        )
 
     def _following(
         self,
@@ -432,18 +424,18 @@ class Robot:
         (pose, angles, uncertainty, truth), twist, model = self._state, self._twist, self._model
         if dt == 0.0 or (truth is None and twist == STANDSTILL):
             return self._state
-        L, k = model.wheel_separation, model.wheel_travel_variance
         if truth is not None:
+            L, k = model.wheel_separation, model.wheel_travel_variance
             truth = truth.after(self._stamp, stamp, twist, L, k)
         if twist == STANDSTILL:
             return pose, angles, uncertainty, truth
         (x, y, theta), (right, left), (v, omega) = pose, angles, twist
-        omega_R, omega_L = model.wheel_speeds(v, omega)
+        (omega_R, omega_L), densities = self._steady or self._find_steady()
         right, left = angles = right + omega_R * dt, left + omega_L * dt
         # A finite sum has finite terms.
         if not (isfinite(right + left) or (isfinite(right) and isfinite(left))):
             raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
-        uncertainty = uncertainty.after((theta, twist, dt, L, k))
+        uncertainty = uncertainty.after(propagated_moments, theta, twist, densities, dt)
         state = arc_end(x, y, theta, v, omega, dt), angles, uncertainty, truth
         self._ahead = stamp, state
         return state
@@ -475,12 +467,13 @@ class Robot:
             if twist == STANDSTILL:
                 return state
             turned = self._model.wheel_speeds(v * dt, omega * dt)
-            uncertainty = uncertainty.after((pose[2], twist, dt, L, k))
+            densities = spectral_densities(v, omega, L, k)
+            uncertainty = uncertainty.after(propagated_moments, pose[2], twist, densities, dt)
             pose = arc_end(*pose, v, omega, dt)
         else:
             _, _, path, turn = piece.state(dt)
             turned = self._model.wheel_speeds(path, turn)
-            uncertainty = uncertainty.after((pose[2], piece, dt, L, k))
+            uncertainty = uncertainty.after(moments_along, pose[2], piece, dt, L, k)
             pose = displaced(pose, piece.displacement(dt))
         return pose, (right + turned[0], left + turned[1]), uncertainty, None
 
@@ -493,10 +486,24 @@ def _robot(
     twist: Twist,
     commanded_at: int | None = None,
     drive: Drive | None = None,
+    steady: Steady | None = None,
 ) -> Robot:
     """Return a robot with checked values, without checking them again for every message."""
     robot = object.__new__(Robot)
-    robot._set(model, stamp, state, command, twist, commanded_at, drive)
+    robot._model, robot._stamp, robot._state = model, stamp, state
+    robot._command, robot._twist, robot._commanded_at = command, twist, commanded_at
+    robot._expiry = None
+    if commanded_at is not None and model.command_timeout:
+        # If the timeout was shortened, it expires now, not in the past.
+        expiry = commanded_at + model.command_timeout
+        robot._expiry = expiry if expiry > stamp else stamp
+    # None: the twist is held until the next event.
+    robot._drive = drive
+    # What the twist implies without a drive. None: it was not needed yet.
+    robot._steady = steady
+    # The last state that was computed from this one, because often the same one is needed next; and where
+    # the last state that was computed along the drive begins (s), and the state there.
+    robot._ahead = robot._knot = None
     return robot
 
 

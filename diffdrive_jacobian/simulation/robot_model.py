@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
@@ -14,6 +14,7 @@ from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_l
 from diffdrive_jacobian.numerics.checks import NotNegative, Positive, numbers
 from diffdrive_jacobian.numerics.fields import Checked, instance, optional
 from diffdrive_jacobian.simulation.actuators import Actuators, Duration, Speeds
+from diffdrive_jacobian.simulation.odometry_noise import spectral_densities
 from diffdrive_jacobian.simulation.slip import Drift
 
 
@@ -23,6 +24,15 @@ def _limits(name: str, value: Any) -> VelocityLimits:
     if not limits.alike:
         raise ValueError(f'{name} must be numbers for one robot, got {limits}')
     return limits
+
+
+class Steady(NamedTuple):
+    """What stays the same while a robot keeps its twist."""
+
+    wheel_speeds: Speeds
+    """`(omega_R, omega_L)` (rad/s)."""
+    densities: tuple[float, float, float]
+    """Spectral densities vv, vw, ww of the noise of the twist."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,7 +75,7 @@ class RobotModel(Checked):
             return v, omega
         radius = max(self.radii)
         try:
-            v, omega = scaled_to_limits.formula(
+            v, omega = scaled_to_limits.floats(
                 v, omega, *self.limits.all(), radius, self.wheel_separation
             )
         except ValueError as error:
@@ -96,12 +106,21 @@ class RobotModel(Checked):
         Raises:
             ValueError: They overflow.
         """
-        right, left = body_to_wheel.formula(v, omega, self.wheel_radius, self.wheel_separation)
+        right, left = body_to_wheel.floats(v, omega, self.wheel_radius, self.wheel_separation)
         right /= self.right_wheel_radius_multiplier
         left /= self.left_wheel_radius_multiplier
         if not (math.isfinite(right) and math.isfinite(left)):
             raise ValueError('twist must give finite wheel speeds, but they overflow')
         return right, left
+
+    def steady(self, twist: tuple[float, float]) -> Steady:
+        """Return what a constant twist `(v, omega)` implies.
+
+        Raises:
+            ValueError: The wheel speeds overflow.
+        """
+        densities = spectral_densities(*twist, self.wheel_separation, self.wheel_travel_variance)
+        return Steady(self.wheel_speeds(*twist), densities)
 
     def twist(self, omega_R: float, omega_L: float) -> tuple[float, float]:
         """Return the twist `(v, omega)` of wheel speeds that are floats (m/s, rad/s).
@@ -111,7 +130,7 @@ class RobotModel(Checked):
         """
         right = omega_R * self.right_wheel_radius_multiplier
         left = omega_L * self.left_wheel_radius_multiplier
-        v, omega = wheel_to_body.formula(right, left, self.wheel_radius, self.wheel_separation)
+        v, omega = wheel_to_body.floats(right, left, self.wheel_radius, self.wheel_separation)
         if not (math.isfinite(v) and math.isfinite(omega)):
             raise ValueError('wheel speeds must give a finite twist, but it overflows')
         return v, omega

@@ -282,7 +282,7 @@ def rolled(course: Course, piece: Piece, seconds: float) -> float:
 def arc_end(x: float, y: float, theta: float, v: float, omega: float, dt: float) -> Pose:
     """Return `se2.integrate` of finite floats, for every message; ValueError if it overflows."""
     try:
-        end_x, end_y, end_theta = integrate.formula((x, y, theta), (v, omega), dt)
+        end_x, end_y, end_theta = integrate.floats((x, y, theta), (v, omega), dt)
         if isfinite(end_x) and isfinite(end_y) and isfinite(end_theta):
             return end_x, end_y, end_theta
     except ValueError:

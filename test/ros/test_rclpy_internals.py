@@ -212,13 +212,22 @@ async def wait(message):
 
 
 @pytest.mark.parametrize(
-    ('callback', 'with_info', 'wait_set'),
-    [(lambda _: None, False, False), (lambda message, info: None, True, True), (wait, False, True)],
+    ('callback', 'received', 'wait_set'),
+    [
+        (lambda message: message, 'message', False),
+        (lambda message, info: (message, info), ('message', {}), True),
+        (wait, None, True),
+    ],
 )
-def test_kinds_of_callbacks_are_detected(node, callback, with_info, wait_set):
+def test_kinds_of_callbacks_are_detected(node, callback, received, wait_set):
     subscription = node.create_subscription(String, 'words', callback, 10)
-    assert internals.receives_info(subscription) == with_info
+    receive = internals.message_receiver(subscription)
+    if received is not None:
+        assert receive(('message', {})) == received
     assert internals.requires_wait_set(node) == wait_set
+    # A callback may be replaced.
+    subscription.callback = lambda message: [message]
+    assert receive(('message', {})) == ['message']
 
 
 def test_a_line_is_logged_with_the_place_of_the_caller(node, monkeypatch, capfd):
