@@ -348,8 +348,10 @@ class BoundLaw:
                 state = tuple(map(float, state))
             else:
                 v, omega = twist
-            if not type(v) is type(omega) is float:
-                v, omega = _number(v), _number(omega)
+            if type(v) is type(omega) is float and isfinite(v) and isfinite(omega) and not state:
+                self._before = self.now
+                return v, omega
+            v, omega = _number(v), _number(omega)
         except (TypeError, ValueError) as error:
             raise LawError(
                 f'the law of controller {name!r} must return (v, omega), two numbers'

@@ -12,16 +12,15 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
-from rclpy.time import Time
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.ros.rclpy_internals import (
     RCLError,
-    SimulatedClock,
+    SimulatedClocks,
     TimerHandle,
-    set_clocks,
+    clock_subscription,
     subscription_counter,
     timer_handle,
 )
@@ -75,7 +74,8 @@ class Clocks:
         self._count_subscriptions: Callable[[], int] = lambda: 0
         self.pauses = 0
         """Number of faults because of which the clocks stand."""
-        self._clocks: list[SimulatedClock] = []
+        self._clocks = SimulatedClocks()
+        self._replaced: set[Subscription] = set()
         self._message = Clock()
 
     def publish_with(self, publisher: Publisher) -> None:
@@ -88,20 +88,21 @@ class Clocks:
         A clock whose topic was renamed follows that topic.
         """
         topic = self._publisher and self._publisher.topic_name
-        replaced = set()
-        self._clocks = []
-        for node in nodes:
-            clock = SimulatedClock(node)
-            if clock.subscription is not None and clock.subscription.topic_name == topic:
-                self._clocks.append(clock)
-                replaced.add(clock.subscription)
-        return replaced
+        found = {node: clock_subscription(node) for node in nodes}
+        set_directly = {
+            node: subscription
+            for node, subscription in found.items()
+            if subscription is not None and subscription.topic_name == topic
+        }
+        self._clocks.take(set_directly)
+        self._replaced = {*set_directly.values()}
+        return self._replaced
 
     def set(self) -> None:
         """Set the clocks to the present time, and publish it if somebody else receives it."""
         now = self.now
-        set_clocks(self._clocks, Time(nanoseconds=now, clock_type=ClockType.ROS_TIME))
-        if self._publisher is not None and self._count_subscriptions() > len(self._clocks):
+        self._clocks.set(now)
+        if self._publisher is not None and self._count_subscriptions() > len(self._replaced):
             set_time(self._message.clock, now)
             self._publisher.publish(self._message)
 
@@ -136,10 +137,11 @@ class Timers:
             of_kind.append((handle.time_until_next_call, (handle, timer, node)))
         self.simulated = {timer for _, (_, timer, _) in self._sim_timers}
 
-    def due(self) -> tuple[list[tuple[int, Entry]], float]:
+    def due(self, *, wall: bool = True) -> tuple[list[tuple[int, Entry]], float]:
         """Return the due timers, the most overdue first, each with the time until it is due (ns).
 
-        And the time until the next one in simulated time (ns); infinity: there is none.
+        And the time until the next one in simulated time (ns); infinity: there is none. With `wall`
+        those on wall time count, too.
         """
         due: list[tuple[int, Entry]] = []
         until_next = math.inf
@@ -151,10 +153,11 @@ class Timers:
                 due.append((left, entry))
             elif left < until_next:
                 until_next = left
-        for time_until, entry in self._wall_timers:
-            left = time_until()
-            if left is not None and left <= 0:
-                due.append((left, entry))
+        if wall:
+            for time_until, entry in self._wall_timers:
+                left = time_until()
+                if left is not None and left <= 0:
+                    due.append((left, entry))
         if len(due) > 1:
             # Stable: timers that are due at the same time stay in the order of their creation.
             due.sort(key=itemgetter(0))

@@ -61,8 +61,10 @@ class Guard:
         self._nodes = nodes
         self.raised: Stuck | None = None
         """What was raised at the current time."""
-        self._since: float | None = None
-        self._seen: dict[str, None] | None = None
+        self.since: float | None = None
+        """Wall time since which callbacks are executed (s); None: none is."""
+        self.seen: dict[str, None] | None = None
+        """The callbacks that were called while they are observed; None: they are not."""
         self._profiler: Any = None
         self._main = threading.get_ident()
         self._closed = threading.Event()
@@ -70,21 +72,10 @@ class Guard:
         self._thread = threading.Thread(target=self._watch, name='lockstep guard', daemon=True)
         self._thread.start()
 
-    def arm(self) -> None:
-        """Start the measurement."""
-        self.raised = None
-        self._since = time.monotonic()
-
     def extend(self, seconds: float) -> None:
         """Leave out a duration (s) for which another process was waited for."""
-        if self._since is not None:
-            self._since += seconds
-
-    def disarm(self) -> None:
-        """Stop the measurement."""
-        self._since = None
-        if self._seen is not None:
-            self._stop_observing()
+        if self.since is not None:
+            self.since += seconds
 
     def close(self) -> None:
         """Stop the thread."""
@@ -93,7 +84,7 @@ class Guard:
         signal.signal(SIGNAL, self._previous)
 
     def _overdue(self) -> bool:
-        return self._since is not None and time.monotonic() - self._since > self._patience
+        return self.since is not None and time.monotonic() - self.since > self._patience
 
     def _watch(self) -> None:
         unanswered = 0
@@ -111,26 +102,27 @@ class Guard:
         if not self._overdue() or any(caller.f_code.co_name == '__del__' for caller in _stack(frame)):
             # An exception in __del__ would be lost. The next signal follows soon.
             return
-        if self._seen is None:
-            self._seen = {}
+        if self.seen is None:
+            self.seen = {}
             self._profiler = sys.getprofile()
             sys.setprofile(self._on_call)
             return
-        self.raised = Stuck(self._diagnose(self._stop_observing(), frame))
+        self.raised = Stuck(self._diagnose(self.stop_observing(), frame))
         # What handles the exception has as much time again, before another one replaces it.
-        self._since = time.monotonic()
+        self.since = time.monotonic()
         raise self.raised
 
-    def _stop_observing(self) -> list[str]:
+    def stop_observing(self) -> list[str]:
+        """Return which callbacks were called, and observe them no longer."""
         sys.setprofile(self._profiler)
-        seen, self._seen = list(self._seen or ()), None
+        seen, self.seen = list(self.seen or ()), None
         return seen
 
     def _on_call(self, frame: FrameType, event: str, _: Any) -> None:
-        if event == 'call' and self._seen is not None and len(self._seen) < MAX_NAMED:
+        if event == 'call' and self.seen is not None and len(self.seen) < MAX_NAMED:
             below = iter(_stack(frame))
             if _is_user(next(below, None)) and not any(map(_is_user, below)) and not _is_standard(frame):
-                self._seen[describe(frame, self._nodes())] = None
+                self.seen[describe(frame, self._nodes())] = None
 
     def _diagnose(self, seen: list[str], frame: FrameType | None) -> str:
         stack = list(filter(_is_user, _stack(frame)))

@@ -132,8 +132,11 @@ class Links:
                     topic = self.topic_name
                     heard = bool(links.to(topic) or links.observers_of_published(topic))
                     note_thread(self, f'publishes {topic}', heard=heard and topic not in NOT_OF_ROBOTS)
-                source = sources.get(self) or links._source_of(self)
-                if (source.stages or gates.running is not None) and links._divert(self, source, msg):
+                try:
+                    source = sources[self]
+                except KeyError:
+                    source = links._source_of(self)
+                if (source.stages or gates.running) and links._divert(self, source, msg):
                     return
                 publish(self, msg)
                 source.count += 1

@@ -239,7 +239,8 @@ class Scheduler:
                 called = True
                 agenda.pop()()
                 self.handle_all()
-            due, until_next = self.timers.due()
+            # Once at each time is enough for those on wall time.
+            due, until_next = self.timers.due(wall=not called)
             if not due:
                 return called, self._sooner(until_next)
             for _, (handle, timer, node) in due:
@@ -301,8 +302,8 @@ class Scheduler:
     def _tick(self, handle: TimerHandle, timer: Timer, node: Node) -> bool:
         """Call the callback of a timer that is due, if the gate of its node lets it tick now.
 
-        Return whether it was called. That of a timer on wall time takes no simulated time, because nobody
-        knows when it comes.
+        Return whether it was called. That of a timer on wall time takes no simulated time, because
+        nobody knows when it comes.
         """
         member = self._members[node]
         gate, simulated = member.gate, timer in self.timers.simulated

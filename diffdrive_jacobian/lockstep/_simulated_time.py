@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar
 
 import rclpy
@@ -58,7 +59,7 @@ class SimulatedTime:
         self._report = report
         # Time until the next timer or action (ns).
         self._until_next = math.inf
-        self.processes: list[Process] = []
+        self.processes: Sequence[Process] = []
         """The other processes, which are checked when all callbacks of a time have been executed."""
         self.check: Callable[[], None] | None = None
         """Called after that, at each simulated time."""
@@ -173,8 +174,8 @@ class SimulatedTime:
         __tracebackhide__ = True
         if self.busy:
             raise LockstepError('a callback cannot advance time, and cannot add or remove nodes')
-        self.busy = True
-        self._guard.arm()
+        self.busy, guard = True, self._guard
+        guard.since = time.monotonic()
         try:
             result = work()
             if self._scheduler.links.elsewhere:
@@ -186,14 +187,15 @@ class SimulatedTime:
             if isinstance(error, RCLError) and not rclpy.ok():
                 raise LockstepError(SHUT_DOWN) from None
             # pybind11 replaces an exception that is raised while it converts an argument.
-            stuck = error if isinstance(error, Stuck) else self._guard.raised
+            stuck, guard.raised = error if isinstance(error, Stuck) else guard.raised, None
             if stuck is None:
                 raise
             at = self._clocks.now / NANOSECONDS
             raise LockstepError(f'at {at:g} s: {stuck}\n{self._report()}') from stuck
         finally:
-            self._guard.disarm()
-            self.busy = False
+            guard.since, self.busy = None, False
+            if guard.seen is not None:
+                guard.stop_observing()
 
     def check_threads(self) -> None:
         """Check that nodes have sent nothing from threads of their own since they were added.

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable
 from collections.abc import Sequence as Values
 from functools import lru_cache
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -48,7 +48,7 @@ SMALLEST = sys.float_info.min
 
 
 def integer_warning(what: str, value: float) -> str:
-    """Return a warning of a value below `SMALLEST`: an integer that was assigned to a field of floats."""
+    """Return a warning of a value below `SMALLEST`: an integer that was assigned to a float field."""
     return (
         f'{what} has the value {value:.3g}: was an int assigned to a float field? Assign 1.0 '
         'instead of 1 (with ROS_PYTHON_CHECK_FIELDS=1 rclpy reports it to the sender)'
@@ -413,22 +413,19 @@ class Writer:
         runs = _runs(encoder, fields)
         content = bytes(encoder.buffer)
         # All is packed at once: what does not change as strings of bytes, between the runs of numbers.
-        layout, end, constants = '<', 0, []
+        constants: list[bytes] = []
+        layout, end, order, count = '<', 0, [], 0
         for run in runs:
+            order += [-1 - len(constants), *range(count, count + run.numbers)]
             constants.append(content[end : run.start])
             layout += f'{run.start - end}s{run.format}'
-            end = run.end
-        tail = content[end:]
-        layout += f'{len(tail)}s' if any(tail) else f'{len(tail)}x'
-        self._tail = (tail,) if any(tail) else ()
+            end, count = run.end, count + run.numbers
+        order += [-1 - len(constants), -2 - len(constants)]
+        constants += [content[end:], b'']
+        layout += f'{len(content) - end}s0s'
+        self._numbers, self._count = numbers, count
+        self._constants, self._in_order = tuple(reversed(constants)), itemgetter(*order)
         self._pack = struct.Struct(layout).pack
-        self._head = constants[:1]
-        ends = list(accumulate(run.numbers for run in runs))
-        # Values after the last run are left to it, which refuses them.
-        parts = [slice(*pair) for pair in pairwise([0, *ends[:-1], None])]
-        self._numbers = numbers
-        self._first = parts[0].stop
-        self._more = list(zip(constants[1:], parts[1:], strict=True))
 
     def __call__(self, *values: Any) -> bytes:
         """Return the message with the numbers of these values.
@@ -437,12 +434,12 @@ class Writer:
             MessageError: A number is out of range for its field, or their count is wrong.
         """
         numbers = self._numbers(*values)
+        if len(numbers) != self._count:
+            raise MessageError(
+                f'{self._name} cannot be serialized: it needs {self._count} numbers, got {len(numbers)}'
+            )
         try:
-            arguments = [*self._head, *numbers[: self._first]]
-            for constant, part in self._more:
-                arguments.append(constant)
-                arguments += numbers[part]
-            return self._pack(*arguments, *self._tail)
+            return self._pack(*self._in_order(numbers + self._constants))
         except (struct.error, OverflowError) as error:
             raise MessageError(f'{self._name} cannot be serialized: {error}') from error
 

@@ -89,7 +89,7 @@ class Codec(Generic[V]):
         return checked
 
     def writer(self, template: Any) -> Writer:
-        """Return what serializes values, given their fields, with the strings and lengths of a template."""
+        """Return what serializes values from their fields, with strings and lengths of a template."""
         return Writer(template, self.written, self.numbers)
 
 
@@ -188,6 +188,18 @@ def _motion(sec: int, nanosec: int, frame: str, *values: Any) -> Motion:
     )
 
 
+def _motion_numbers(
+    stamp: int,
+    frame: str,
+    pose: tuple[float, float, float],
+    twist: tuple[float, float],
+    covariance: tuple[float, ...] = _ZERO_POSE_COVARIANCE,
+    twist_covariance: tuple[float, ...] = _ZERO_TWIST_COVARIANCE,
+) -> tuple[float, ...]:
+    times = divmod(stamp, NANOSECONDS)
+    return (*times, *_pose_numbers(pose), *covariance, *twist, *twist_covariance)
+
+
 def _place(sec: int, nanosec: int, frame: str, *values: Any) -> Place:
     *pose, covariance = values
     return Place(from_time(sec, nanosec), frame, from_pose(*pose), _planar(covariance))
@@ -212,13 +224,7 @@ ODOMETRY = Codec(
         *('twist.twist.linear.x', 'twist.twist.angular.z'),
         *(f'twist.covariance[{index}]' for index in _FORWARD_AND_YAW),
     ),
-    lambda stamp, frame, pose, twist, covariance=_ZERO_POSE_COVARIANCE, twist_covariance=_ZERO_TWIST_COVARIANCE: (
-        *divmod(stamp, NANOSECONDS),
-        *_pose_numbers(pose),
-        *covariance,
-        *twist,
-        *twist_covariance,
-    ),
+    _motion_numbers,
 )
 MOTION = Codec(
     'nav_msgs/msg/Odometry',
@@ -380,7 +386,9 @@ class Wheels(NamedTuple):
         angles: tuple[float, float] | None = None,
     ) -> Wheels:
         """Return both joints, from `(omega_R, omega_L)` (rad/s) and angles (rad) in that order."""
-        return cls(stamp, joints, () if angles is None else angles[::-1], speeds[::-1])
+        # Without the cost of the constructor: this runs for each odometry.
+        positions = () if angles is None else angles[::-1]
+        return tuple.__new__(cls, (stamp, joints, positions, speeds[::-1]))
 
     def speeds(self, names: tuple[str, str]) -> tuple[float, float]:
         """Return `(omega_R, omega_L)` (rad/s) of the left and the right wheel joint of these names.

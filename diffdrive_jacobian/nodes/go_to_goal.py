@@ -36,7 +36,7 @@ from diffdrive_jacobian.messages.codecs import (
 )
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.messages.topics import SEVERAL, UNREAD
-from diffdrive_jacobian.nodes.other_drivers import OtherDrivers
+from diffdrive_jacobian.nodes.other_drivers import PERIOD, OtherDrivers
 from diffdrive_jacobian.nodes.stopping import overshoot_warnings, rolls_on
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.ros import serialization
@@ -388,9 +388,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         goal, now = self._goal, self.now()
         try:
             pose = messages.from_pose(*values)
-            if frame != self._odom_frame and (
-                self._driving or (goal is not None and goal.executing)
-            ):
+            if frame != self._odom_frame and (self._driving or (goal is not None and goal.executing)):
                 raise MessageError(
                     f"it must stay in frame '{printable(self._odom_frame)}', got '{printable(frame)}'"
                 )
@@ -403,7 +401,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if goal is None:
             return
         self._watchdog.feed(now)
-        self._others.search(now)
+        if not 0 <= now - self._others.searched < PERIOD:
+            self._others.search(now)
         if len(self._times) <= RATE_PERIODS:
             self._measure_rate(now)
         if not goal.executing and not self._begin(goal, pose):
@@ -538,6 +537,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         """Publish a command at a time (ns); None: now."""
         now = self.now() if now is None else now
         commands, delay = self._commands, self._actuators.delay
+        if not delay:
+            commands.clear()
         while len(commands) > 1 and commands[1][0] <= now - delay:
             commands.popleft()
         commands.append((now, v, omega))

@@ -50,7 +50,8 @@ class OtherDrivers:
         kind = publisher.msg_type
         codec = TWIST_STAMPED if kind.__name__ == 'TwistStamped' else TWIST
         self._read = codec.reader(kind, deserialize_message)
-        self._searched = 0
+        self.searched = 0
+        """Time of the last search (ns)."""
 
     @property
     def subscriptions(self) -> int:
@@ -67,14 +68,13 @@ class OtherDrivers:
         self._active = False
 
     def search(self, now: int) -> None:
-        """Search for other drivers if that is due at a time of the node (ns).
+        """Search for other drivers, at a time of the node (ns): after each `PERIOD`.
 
-        It is called for each odometry. With a timer a simulated run would take longer.
+        With a timer a simulated run would take longer.
         """
-        if not 0 <= now - self._searched < PERIOD:
-            self._searched = now
-            # Runs in simulated time must be reproducible.
-            self._search(0.0 if self._clock.ros_time_is_active else MAX_AGE)
+        self.searched = now
+        # Runs in simulated time must be reproducible.
+        self._search(0.0 if self._clock.ros_time_is_active else MAX_AGE)
 
     def _search(self, max_age: float = 0.0) -> None:
         if self._subscribed:

@@ -28,6 +28,7 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.cdr import SMALLEST
 from diffdrive_jacobian.messages.codecs import (
     JOINT_STATE,
     ODOMETRY,
@@ -40,9 +41,10 @@ from diffdrive_jacobian.messages.codecs import (
 from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
 from diffdrive_jacobian.messages.topics import GOALS_LOST, SEVERAL, UNPUBLISHED
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
-from diffdrive_jacobian.ros.graph_faults import Interleaving, topic_check
+from diffdrive_jacobian.ros.graph_faults import topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
+from diffdrive_jacobian.ros.serialization import Interleaving
 from diffdrive_jacobian.ros.watchdog import command_time
 from diffdrive_jacobian.simulation.encoders import Encoders
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
@@ -144,8 +146,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             robot = robot.at(self._latest).restarted(now)
             self._publish_start(robot)
             self._publish_applied(robot)
-        elif robot.expiry is not None and robot.expiry <= now:
-            robot = robot.at(robot.expiry)
+        elif (expiry := robot.expiry) is not None and expiry <= now:
+            robot = robot.at(expiry)
             self._publish_applied(robot)
         self._robot, self._latest = robot, now
         return now, robot
@@ -183,7 +185,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             state.twist_covariance_tuple(self._period),
         )
         self._odom.publish(data)
-        wheels = Wheels.of(now, parameters.wheel_names, state.wheel_speeds, state.wheel_angles)
+        wheels = Wheels.of(now, self._wheel_names, state.wheel_speeds, state.wheel_angles)
         self._joint_states.publish(self._serialized_joints(*wheels))
         if self._ground_truth is not None:
             frame = parameters.ground_truth_frame_id
@@ -210,13 +212,16 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             now, robot = self._present()
             twist, stamp = read(*fields)
             timeout = robot.model.command_timeout
-            time = command_time(stamp, now, robot.stamp, timeout)
+            time = command_time(stamp, now, robot.stamp, timeout) if stamp else now
         except MessageError as error:
             self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
             return
-        if twist[0] or twist[1]:
+        v, omega = twist
+        if v or omega:
             self._commands.count()
-            self.warn_of_integers('a command', *twist)
+            # Not a call for each message.
+            if min(abs(v) or 1.0, abs(omega) or 1.0) < SMALLEST:
+                self.warn_of_integers('a command', v, omega)
         self._robot = robot.commanded(twist, time)
         self._publish_applied(self._robot)
 
@@ -317,7 +322,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         start, command = PoseWithCovarianceStamped(), TwistStamped()
         self._odometry.header.frame_id = start.header.frame_id = parameters.odom_frame_id
         command.header.frame_id = parameters.base_frame_id
-        joints = JointState(name=[*parameters.wheel_names], position=[0.0, 0.0], velocity=[0.0, 0.0])
+        self._wheel_names = parameters.wheel_names
+        joints = JointState(name=[*self._wheel_names], position=[0.0, 0.0], velocity=[0.0, 0.0])
         self._serialized_odometry = ODOMETRY.writer(self._odometry)
         self._serialized_truth = ODOMETRY.writer(truth)
         self._serialized_start = POSE_WITH_COVARIANCE.writer(start)

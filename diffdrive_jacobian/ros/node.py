@@ -38,7 +38,6 @@ from diffdrive_jacobian.ros.graph_faults import (
     ALTERNATION_PATIENCE,
     MAX_AGE,
     TYPE_PATIENCE,
-    Interleaving,
     LastingFault,
     SharedGraph,
     alternating_commands,
@@ -49,7 +48,7 @@ from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.parameters import declare, declare_new
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.rclpy_internals import log_info, parameter_overrides, reason, time_reader
-from diffdrive_jacobian.ros.serialization import decoding
+from diffdrive_jacobian.ros.serialization import Interleaving, decoding
 from diffdrive_jacobian.text import printable
 
 P = TypeVar('P', bound=NodeParameters)

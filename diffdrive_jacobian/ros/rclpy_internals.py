@@ -21,6 +21,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.executors import Executor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -242,33 +243,42 @@ def timer_handle(timer: Timer) -> TimerHandle:
     return handle
 
 
-class SimulatedClock:
-    """The clock of a node whose time is set directly, instead of by a message on /clock.
+def clock_subscription(node: Node) -> Subscription | None:
+    """Return the subscription that receives the time of a node. None: its clock shows wall time.
 
-    Relies on `Node._time_source`, `TimeSource._clock_sub` and `TimeSource._associated_clocks`, and on
-    `ROSClock.handle`, with which to set the time takes half as long.
+    Relies on `Node._time_source` and `TimeSource._clock_sub`.
+    """
+    subscription: Subscription | None = node._time_source._clock_sub
+    return subscription
+
+
+class SimulatedClocks:
+    """The clocks of nodes, whose time is set directly, instead of by a message on /clock.
+
+    Does what `TimeSource.clock_callback` does, for all at once. Relies on `Node._time_source`,
+    `TimeSource._last_time_set`, `TimeSource._associated_clocks`, `ROSClock.handle`, `Time._time_handle`
+    and `rcl_time_point_t`.
     """
 
-    __slots__ = ('overrides', 'source', 'subscription')
+    def __init__(self) -> None:
+        """Start without clocks."""
+        self._time = Time(clock_type=ClockType.ROS_TIME)
+        self._overrides: list[Callable[[Any], None]] = []
 
-    def __init__(self, node: Node) -> None:
-        """Take the clock of a node."""
-        self.source = node._time_source
-        self.subscription: Subscription | None = self.source._clock_sub
-        """Subscription that would receive the time. None: the clock shows wall time."""
-        self.overrides = [clock.handle.set_ros_time_override for clock in self.source._associated_clocks]
+    def take(self, nodes: Iterable[Node]) -> None:
+        """Take the clocks of nodes instead of those before."""
+        self._overrides = []
+        for node in nodes:
+            source = node._time_source
+            # It changes with each `set`.
+            source._last_time_set = self._time
+            self._overrides += [one.handle.set_ros_time_override for one in source._associated_clocks]
 
-
-def set_clocks(clocks: Iterable[SimulatedClock], now: Time) -> None:
-    """Set the time of clocks. Callbacks for jumps are called.
-
-    Does what `TimeSource.clock_callback` does. Relies on `TimeSource._last_time_set` and
-    `Time._time_handle`.
-    """
-    handle = now._time_handle
-    for clock in clocks:
-        clock.source._last_time_set = now
-        for override in clock.overrides:
+    def set(self, now: int) -> None:
+        """Set the time (ns). Callbacks for jumps are called."""
+        handle = rclpy_implementation.rcl_time_point_t(now, ClockType.ROS_TIME)
+        self._time._time_handle = handle
+        for override in self._overrides:
             override(handle)
 
 
@@ -493,8 +503,8 @@ def lost_messages(subscription: Subscription) -> int:
 def request_message_info(callback: Callable[..., None]) -> None:
     """Let a callback of a subscription receive the message and its info.
 
-    The SingleThreadedExecutor passes them as two arguments, the EventsExecutor of Jazzy as one tuple: the
-    callback must accept both. The times in the info are right on the SingleThreadedExecutor only.
+    The SingleThreadedExecutor passes them as two arguments, the EventsExecutor of Jazzy as one tuple:
+    the callback must accept both. The times in the info are right on the SingleThreadedExecutor only.
     Relies on `Subscription.callback` deciding by the signature whether the info is passed.
     """
     kind = inspect.Parameter.POSITIONAL_ONLY

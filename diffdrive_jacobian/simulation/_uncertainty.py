@@ -164,23 +164,21 @@ class Uncertainty:
 
     def moments(self) -> Entries:
         """Return the entries of the moments; ValueError if they overflow."""
-        moments = self._moments
-        if moments is None:
+        if self._moments is None:
             self._evaluate()
-            moments = self._moments
-            if moments is None:
+            if self._moments is None:
                 raise ValueError('twist and time must give a finite result, but it overflows')
-        return moments
+        return self._moments
 
     def _evaluate(self) -> None:
         """Evaluate the pending arcs in their order. Several threads may do so at once."""
         waiting = []
         here, pending = self, self._pending
         while pending is not None:
-            waiting.append((here, *pending))
+            waiting.append((here, pending))
             here = pending[0]
             pending = here._pending
-        for here, before, propagated, arc in reversed(waiting):
+        for here, (before, propagated, arc) in reversed(waiting):
             if before._moments is not None:
                 # After an overflow there is none.
                 here._moments = propagated(before._moments, *arc)

@@ -53,7 +53,7 @@ class Encoders:
         )
         model, dt = robot.model, (robot.stamp - self.stamp) / NANOSECONDS
         distance, turn = model.twist(right, left)
-        pose = arc_end(*self.pose, distance, turn, 1.0)
+        pose = arc_end(self.pose, (distance, turn), 1.0)
         # Time may have gone back.
         speeds = (right / dt, left / dt) if dt > 0.0 else (0.0, 0.0)
         return Encoders(self.per_revolution, robot.stamp, counts, pose, speeds)

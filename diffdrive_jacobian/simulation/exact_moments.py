@@ -254,9 +254,9 @@ def propagated_moments(
     densities: tuple[float, float, float],
     dt: float,
 ) -> Entries | None:
-    """Return `propagate_moments` of values that were checked, and of the `spectral_densities` of the twist.
+    """Return `propagate_moments` of values that were checked; None: they overflow.
 
-    None: they overflow.
+    `densities` are the `spectral_densities` of the twist.
     """
     (v, omega), (vv, vw, ww) = twist, densities
     try:

@@ -373,9 +373,7 @@ class Robot:
     def _with(self, stamp: int, state: _State) -> Robot:
         """Return the robot in another state, with the same motion."""
         command, twist, steady = self._command, self._twist, self._steady
-        return _robot(
-            self._model, stamp, state, command, twist, self._commanded_at, self._drive, steady
-        )
+        return _robot(self._model, stamp, state, command, twist, self._commanded_at, self._drive, steady)
 
     def _following(
         self,
@@ -421,22 +419,22 @@ class Robot:
             self._ahead = stamp, state
             return state
         dt = (stamp - self._stamp) / NANOSECONDS
-        (pose, angles, uncertainty, truth), twist, model = self._state, self._twist, self._model
-        if dt == 0.0 or (truth is None and twist == STANDSTILL):
+        if dt == 0.0:
             return self._state
+        pose, angles, uncertainty, truth = self._state
+        twist = self._twist
         if truth is not None:
-            L, k = model.wheel_separation, model.wheel_travel_variance
+            L, k = self._model.wheel_separation, self._model.wheel_travel_variance
             truth = truth.after(self._stamp, stamp, twist, L, k)
         if twist == STANDSTILL:
             return pose, angles, uncertainty, truth
-        (x, y, theta), (right, left), (v, omega) = pose, angles, twist
         (omega_R, omega_L), densities = self._steady or self._find_steady()
-        right, left = angles = right + omega_R * dt, left + omega_L * dt
+        right, left = angles = angles[0] + omega_R * dt, angles[1] + omega_L * dt
         # A finite sum has finite terms.
         if not (isfinite(right + left) or (isfinite(right) and isfinite(left))):
             raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
-        uncertainty = uncertainty.after(propagated_moments, theta, twist, densities, dt)
-        state = arc_end(x, y, theta, v, omega, dt), angles, uncertainty, truth
+        uncertainty = uncertainty.after(propagated_moments, pose[2], twist, densities, dt)
+        state = arc_end(pose, twist, dt), angles, uncertainty, truth
         self._ahead = stamp, state
         return state
 
@@ -469,7 +467,7 @@ class Robot:
             turned = self._model.wheel_speeds(v * dt, omega * dt)
             densities = spectral_densities(v, omega, L, k)
             uncertainty = uncertainty.after(propagated_moments, pose[2], twist, densities, dt)
-            pose = arc_end(*pose, v, omega, dt)
+            pose = arc_end(pose, twist, dt)
         else:
             _, _, path, turn = piece.state(dt)
             turned = self._model.wheel_speeds(path, turn)
@@ -501,8 +499,8 @@ def _robot(
     robot._drive = drive
     # What the twist implies without a drive. None: it was not needed yet.
     robot._steady = steady
-    # The last state that was computed from this one, because often the same one is needed next; and where
-    # the last state that was computed along the drive begins (s), and the state there.
+    # The last state that was computed from this one, because often the same one is needed next; and
+    # where the last state that was computed along the drive begins (s), and the state there.
     robot._ahead = robot._knot = None
     return robot
 

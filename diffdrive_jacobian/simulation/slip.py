@@ -109,7 +109,7 @@ class Truth:
         if drift.seed is None or not k:
             dt = (stamp - start) / NANOSECONDS
             v, omega = (right + left) / 2.0, (right - left) / separation
-            return Truth(drift, arc_end(*self.pose, v, omega, dt))
+            return Truth(drift, arc_end(self.pose, (v, omega), dt))
         motion = start, twist, L, k
         since = self._since(start, twist)
         time, pose, slipped = start, self.pose, self._present(start, twist)
@@ -128,12 +128,12 @@ class Truth:
             v, omega = (rim_R + rim_L) / 2.0, (rim_R - rim_L) / separation
             if stamp < end:
                 dt = (stamp - time) / NANOSECONDS
-                pose = arc_end(*pose, v, omega, dt)
+                pose = arc_end(pose, (v, omega), dt)
                 a_R, V_R = a_R + gain_R * dt, V_R + growth_R * dt
                 a_L, V_L = a_L + gain_L * dt, V_L + growth_L * dt
                 slipped = level, cell, a_R, V_R, a_L, V_L
                 break
-            pose = arc_end(*pose, v, omega, rest)
+            pose = arc_end(pose, (v, omega), rest)
             time, slipped = end, None
             self._ahead = motion, time, pose
         return Truth(drift, pose, slipped, (twist, since))

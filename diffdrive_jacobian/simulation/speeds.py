@@ -279,12 +279,12 @@ def rolled(course: Course, piece: Piece, seconds: float) -> float:
     return sum(abs(end - begin) for begin, end in pairwise(places))
 
 
-def arc_end(x: float, y: float, theta: float, v: float, omega: float, dt: float) -> Pose:
+def arc_end(pose: Pose, twist: Twist, dt: float) -> Pose:
     """Return `se2.integrate` of finite floats, for every message; ValueError if it overflows."""
     try:
-        end_x, end_y, end_theta = integrate.floats((x, y, theta), (v, omega), dt)
-        if isfinite(end_x) and isfinite(end_y) and isfinite(end_theta):
-            return end_x, end_y, end_theta
+        x, y, theta = integrate.floats(pose, twist, dt)
+        if isfinite(x) and isfinite(y) and isfinite(theta):
+            return x, y, theta
     except ValueError:
         # math.sin(inf)
         pass

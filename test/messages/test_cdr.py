@@ -163,6 +163,10 @@ LENGTHS = [
 ]
 
 
+NESTED = Float64MultiArray, ParameterEvent
+"""Types with sequences in nested structures, which rclpy reads as empty if they are longer than the rest."""
+
+
 @by_class
 @quickly
 @given(data=st.data())
@@ -187,7 +191,7 @@ def test_damaged_or_random_bytes_are_refused_or_read_as_by_rclpy(message_class, 
     for content in (bytes(damaged), random):
         ours, theirs = outcome(read, content), rclpy_outcome(message_class, fields, content)
         # The exception is that of the test of sequences in nested structures.
-        assert ours == theirs or (ours is None and message_class is Float64MultiArray)
+        assert ours == theirs or (ours is None and message_class in NESTED)
 
 
 @pytest.mark.parametrize(

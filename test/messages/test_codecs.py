@@ -94,6 +94,7 @@ def test_the_controller_reads_frame_and_pose_of_an_odometry():
 
 
 times = st.integers(0, 2**31 * 10**9 - 1)
+stamps = times.map(lambda time: divmod(time, 10**9))
 numbers = st.floats(-1e3, 1e3)
 pairs = st.tuples(numbers, numbers)
 # The heading is read from a quaternion.
@@ -112,7 +113,11 @@ WRITTEN = [
         PoseWithCovarianceStamped(),
         st.builds(Place, times, st.just(''), poses, spreads),
     ),
-    (POSE, PoseStamped(), st.builds(Route, times.map(lambda time: divmod(time, 10**9)), st.just(''), st.tuples(poses))),
+    (
+        POSE,
+        PoseStamped(),
+        st.builds(Route, times.map(lambda time: divmod(time, 10**9)), st.just(''), st.tuples(poses)),
+    ),
     (
         JOINT_STATE,
         JointState(name=['l', 'r'], position=[0.0, 0.0], velocity=[0.0, 0.0]),

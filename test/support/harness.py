@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-PATIENCE = 20.0
+PATIENCE = 60.0
 """How long a condition may take to come true before the test fails (s)."""
 
 

@@ -1,0 +1,69 @@
+"""What one message costs, in counts: a loss of speed that no test of time would notice fails here.
+
+Who raises a limit says why in the commit. Limits are those of today, with 1 % for bytecodes.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.process
+
+COUNTS = Path(__file__).with_name('counts.py')
+LIMITS = {
+    # One odometry message of robot and controller in lockstep.
+    'lockstep': {'calls': 116, 'functions': 80, 'files': 26},
+    # The same on the executor of their programs; only functions of the package are counted.
+    'executor': {'calls': 91, 'functions': 63, 'files': 21},
+    # One step of a batch of 100 closed loops.
+    'batch': {'calls': 83, 'functions': 21, 'files': 6},
+    # The start of a program: modules of the package, and all, of which a ROS installation may have fewer.
+    'virtual_robot': {'own modules': 56, 'modules': 500},
+    'go_to_goal': {'own modules': 70, 'modules': 500},
+    'wheel_bridge': {'own modules': 55, 'modules': 490},
+}
+BYTECODES = {
+    'lockstep': {(3, 10): 4500, (3, 11): 4600, (3, 12): 4330, (3, 13): 4130},
+    'executor': {(3, 10): 5090, (3, 11): 4840, (3, 12): 4590, (3, 13): 4560},
+    'batch': {(3, 10): 1930, (3, 11): 2040, (3, 12): 1870, (3, 13): 1730},
+}
+"""Limits by version of Python; others have none."""
+SLACK = 0.05
+"""Share of a limit by which a count may be below it. A limit that is too high would notice nothing."""
+
+
+@functools.cache
+def counted(what: str) -> dict[str, float]:
+    """Return the figures that `counts.py` prints."""
+    program = what if 'modules' in LIMITS[what] else ''
+    environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF', 'PROGRAM': program}
+    command = [sys.executable, str(COUNTS), 'imports' if program else what]
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    figures: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return figures
+
+
+@pytest.mark.parametrize('what', LIMITS)
+def test_a_message_costs_at_most_what_it_did(what):
+    limits = dict(LIMITS[what])
+    if what in BYTECODES and sys.version_info[:2] in BYTECODES[what]:
+        limits['bytecodes'] = BYTECODES[what][sys.version_info[:2]]
+    figures = counted(what)
+    beyond = {name: (figures[name], limit) for name, limit in limits.items() if figures[name] > limit}
+    assert not beyond, f'{what}: beyond its limits: {beyond}'
+    loose = {
+        name: (figures[name], limit)
+        for name, limit in limits.items()
+        if name != 'modules' and figures[name] < (1.0 - SLACK) * limit
+    }
+    assert not loose, f'{what}: lower these limits, which would notice nothing: {loose}'
