@@ -1,8 +1,8 @@
-"""Count what is executed for one message: calls, bytecodes, functions and files. `python counts.py WHAT`.
+"""Count what is executed for one message: calls, bytecodes, functions and files.
 
-In a process of its own, because pytest rewrites assertions of the package, and prints JSON. Counts do not
-depend on the speed of the machine: they repeat to the last one. Only what nodes do once a second of wall
-time, the checks of the graph, is left out.
+`python counts.py WHAT` prints JSON. It is a process of its own: pytest rewrites assertions of the
+package. Counts do not depend on the speed of the machine. Only what nodes do once a second of wall time,
+the checks of the graph, is left out.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def executor() -> dict[str, float]:
     from diffdrive_jacobian.ros.runner import make_executor, ros_context
 
     with ros_context(['counts', *QUIET], default=True) as context:
-        robot, controller, goal = _nodes()
+        robot, controller, _ = _nodes()
         spinner: Any = make_executor(context, isolated=False)
         for node in (robot, controller):
             spinner.add_node(node)

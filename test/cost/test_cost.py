@@ -24,7 +24,7 @@ LIMITS = {
     'executor': {'calls': 91, 'functions': 63, 'files': 21},
     # One step of a batch of 100 closed loops.
     'batch': {'calls': 83, 'functions': 21, 'files': 6},
-    # The start of a program: modules of the package, and all, of which a ROS installation may have fewer.
+    # The start of a program: modules of the package, and all. A ROS installation may have fewer.
     'virtual_robot': {'own modules': 56, 'modules': 500},
     'go_to_goal': {'own modules': 70, 'modules': 500},
     'wheel_bridge': {'own modules': 55, 'modules': 490},

@@ -164,7 +164,7 @@ LENGTHS = [
 
 
 NESTED = Float64MultiArray, ParameterEvent
-"""Types with sequences in nested structures, which rclpy reads as empty if they are longer than the rest."""
+"""Types with sequences in nested structures: rclpy reads too long ones as empty."""
 
 
 @by_class
