@@ -1,9 +1,9 @@
 """An executor as cheap as the EventsExecutor of rclpy and as fair as its SingleThreadedExecutor.
 
-The EventsExecutor takes half the CPU time. Its queue is first in, first out, and unbounded. If messages
-arrive faster than they are handled, timers and services wait behind all of them, and the memory grows.
-The SingleThreadedExecutor handles at most one message of each subscription before it looks at timers
-and services again. Nodes run on the EventsExecutor until that hurts, and then on the
+The EventsExecutor takes less than half the CPU time. Its queue is first in, first out, and unbounded. If
+messages arrive faster than they are handled, timers and services wait behind all of them, and the memory
+grows. The SingleThreadedExecutor handles at most one message of each subscription before it looks at
+timers and services again. Nodes run on the EventsExecutor until that hurts, and then on the
 SingleThreadedExecutor until the program ends.
 
 What hurts is measured by a task that is put into the queue from time to time. It runs after all events
@@ -119,8 +119,8 @@ class GuardedExecutor:
         ):
             self._nodes[0].get_logger().warning(
                 f'messages or requests arrive faster than they are handled, events waited '
-                f'{waited * 1e3:.0f} ms: from now on timers and services take turns with them, which '
-                'takes about twice the CPU time, until this program is restarted'
+                f'{waited * 1e3:.0f} ms: until this program is restarted, timers and services take '
+                'turns with them, which takes two to three times the CPU time'
             )
             self.use_single_threaded()
         elif self._sample.done():
