@@ -214,7 +214,8 @@ class _Survey:
         """Descriptions of messages that cannot be decoded, and of topics that were not checked."""
         return (
             *(
-                f'{count} of {self._messages[topic]} messages on {printable(topic)} cannot be decoded'
+                f'{count} of {self._messages[topic]} messages on {printable(topic)} cannot be decoded '
+                'as little-endian CDR'
                 for topic, count in self._undecodable.items()
             ),
             *(

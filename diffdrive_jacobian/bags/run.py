@@ -309,7 +309,8 @@ class _Tally:
         for topic in sorted(expected):
             for count, why in (
                 (self.foreign[topic], f'were recorded with another definition of {types[topic]}'),
-                (self.invalid[topic] + self.undecodable[topic], 'cannot be decoded'),
+                (self.invalid[topic], 'cannot be decoded'),
+                (self.undecodable[topic], 'cannot be decoded as little-endian CDR'),
                 (self.refused[topic], 'hold invalid or implausible values'),
             ):
                 if count:

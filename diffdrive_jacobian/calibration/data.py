@@ -456,7 +456,7 @@ def _read(
         except LongMessageError:
             tally[topic, 'have more values than are read'] += 1
         except DecodingError:
-            tally[topic, 'cannot be decoded'] += 1
+            tally[topic, 'cannot be decoded as little-endian CDR'] += 1
         except MessageError:
             tally[topic, 'hold invalid or implausible values'] += 1
     for topic, count in invalid.items():

@@ -1,4 +1,4 @@
-"""What nodes run on: environment variables, versions, shared memory, network interfaces, multicast."""
+"""What nodes run on: environment variables, versions, shared memory."""
 
 from __future__ import annotations
 
@@ -6,10 +6,7 @@ import fcntl
 import importlib.util
 import os
 import platform
-import secrets
 import shutil
-import socket
-import struct
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -220,14 +217,6 @@ def _check_discovery(found: Environment) -> Iterator[Problem]:
 
 
 SHARED_MEMORY = Path('/dev/shm')
-SIOCGIFFLAGS = 0x8913
-"""Request for the flags of an interface, as in linux/sockios.h."""
-IFF_UP, IFF_LOOPBACK, IFF_MULTICAST = 0x1, 0x8, 0x1000
-"""Flags of network interfaces, as in linux/if.h."""
-MULTICAST_GROUP = '239.255.0.1'
-"""Group by which participants of DDS discover each other."""
-MULTICAST_PATIENCE = 0.3
-"""Longest way of a message to this process itself (s)."""
 SCARCE = 4_000_000
 """Free shared memory below which segments cannot be created (bytes). A participant needs 0.7 MB."""
 
@@ -245,16 +234,6 @@ class SharedMemory:
     """Number of segments of processes that were killed."""
     stale_bytes: int = 0
     """Their size (bytes)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Interface:
-    """A network interface."""
-
-    name: str
-    up: bool
-    loopback: bool
-    multicast: bool
 
 
 def shared_memory(path: Path = SHARED_MEMORY) -> SharedMemory | None:
@@ -285,46 +264,6 @@ def _stale_segments(path: Path) -> Iterator[int]:
                 yield lock.with_name(lock.name.removesuffix('_el')).stat().st_size
 
 
-def interfaces() -> tuple[Interface, ...]:
-    """Return the network interfaces, sorted by name. Empty: they are unknown."""
-    found = []
-    with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as query:
-        for _, name in socket.if_nameindex():
-            request = struct.pack('16sh22x', name.encode(), 0)
-            _, flags = struct.unpack('16sH22x', fcntl.ioctl(query, SIOCGIFFLAGS, request))
-            found.append(
-                Interface(
-                    printable(name),
-                    up=bool(flags & IFF_UP),
-                    loopback=bool(flags & IFF_LOOPBACK),
-                    multicast=bool(flags & IFF_MULTICAST),
-                )
-            )
-    return tuple(sorted(found, key=lambda one: one.name))
-
-
-def multicast_error() -> str:
-    """Send a multicast message to this process; return why it did not arrive, or ''."""
-    word = secrets.token_bytes(16)
-    try:
-        with (
-            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
-            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
-        ):
-            receiver.bind(('', 0))
-            member = socket.inet_aton(MULTICAST_GROUP) + socket.inet_aton('0.0.0.0')
-            receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
-            receiver.settimeout(MULTICAST_PATIENCE)
-            sender.sendto(word, (MULTICAST_GROUP, receiver.getsockname()[1]))
-            while receiver.recv(64) != word:
-                pass
-    except TimeoutError:
-        return 'no message arrives'
-    except OSError as error:
-        return (error.strerror or str(error)).lower()
-    return ''
-
-
 def check_shared_memory(memory: SharedMemory | None) -> Iterator[Problem]:
     """Yield what is wrong with the shared memory."""
     if memory is None or not memory.writable:
@@ -346,44 +285,5 @@ def check_shared_memory(memory: SharedMemory | None) -> Iterator[Problem]:
         yield Problem(
             f'{stale} take {format_size(memory.stale_bytes)}',
             'run `fastdds shm clean`, which removes them',
-            problem=False,
-        )
-
-
-def check_network(found: tuple[Interface, ...], reach: str, multicast: str) -> Iterator[Problem]:
-    """Yield what is wrong with the network.
-
-    Args:
-        found: The interfaces. Empty: they are unknown.
-        reach: The discovery range.
-        multicast: Why multicast does not work. Empty: it does, or was not tried.
-    """
-    loopback = [one for one in found if one.loopback]
-    if found and not any(one.up for one in loopback):
-        yield Problem(
-            'the loopback interface is down: nodes on this machine do not find each other',
-            'ip link set lo up',
-        )
-    if reach != 'SUBNET':
-        return
-    others = [one for one in found if one.up and not one.loopback]
-    if found and not others:
-        yield Problem(
-            'no network interface is up: nodes on other machines are not found',
-            'connect the network, or set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
-            problem=False,
-        )
-    elif found and not any(one.multicast for one in others):
-        names = ', '.join(one.name for one in others)
-        yield Problem(
-            f'no network interface has multicast ({names}): nodes on other machines are not found',
-            f'ip link set {others[0].name} multicast on, or name the other machines in ROS_STATIC_PEERS',
-        )
-    elif multicast:
-        yield Problem(
-            f'multicast does not work ({multicast}): nodes on other machines are not found',
-            'permit UDP to 239.255.0.0/16 in the firewall, or name the other machines in '
-            'ROS_STATIC_PEERS',
-            # Nodes on this machine find each other without it.
             problem=False,
         )

@@ -27,12 +27,13 @@ from diffdrive_jacobian.diagnosis.graph import (
     Quality,
     Stream,
 )
-from diffdrive_jacobian.messages.cdr import DecodingError, Reader
+from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import CLOCK as CLOCK_TIME
 from diffdrive_jacobian.messages.codecs import STAMP
 from diffdrive_jacobian.messages.names import full_name, node_of, type_name
 from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.ros.serialization import reader
 from diffdrive_jacobian.ros.service_client import ServiceClient, ignore
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
@@ -245,7 +246,7 @@ def _nearer(one: float | None, other: float) -> float:
 
 def _stamp_reader(kind: type, fields: tuple[str, ...]) -> Callable[[bytes], int]:
     """Return a function that returns a time in a serialized message (ns); 0: it is none."""
-    read = Reader(kind, fields, whole=False)
+    read = reader(kind, fields, whole=False)
 
     def stamp(data: bytes) -> int:
         try:

@@ -4,9 +4,9 @@ rclpy converts each message between CDR bytes and nested Python objects, which c
 sending the bytes costs. A `Writer` packs numbers into the bytes of a template. A `Reader` unpacks the
 fields that are asked for. Both follow from the `Structure` of the message. None of them needs rclpy.
 
-CDR, version 1: 4 bytes of encapsulation (0, 1 for little-endian or 0 for big-endian, and 2 that are
-ignored), then the fields in order, each number aligned to its size. Alignment counts from the end of the
-encapsulation.
+Little-endian CDR, version 1: 4 bytes of encapsulation (0, 1, and 2 that are ignored), then the fields in
+order, each number aligned to its size. Alignment counts from the end of the encapsulation. Other
+encodings, such as those of big-endian machines, are left to rclpy.
 """
 
 from __future__ import annotations
@@ -24,11 +24,9 @@ from typing import Any, NamedTuple
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.structure import (
-    BIG_ENDIAN,
     COUNT,
     ENCAPSULATION,
     LITTLE_ENDIAN,
-    PLAIN,
     Array,
     FieldType,
     Number,
@@ -106,8 +104,9 @@ class Reader:
                 sequence, `goals[].pose.position.x` a tuple with that field of each of its elements.
             whole: Whether what follows the last field must be valid too.
             bounded: Whether to refuse messages with more than 200,000 values and strings to read.
-            deserialize: `rclpy.serialization.deserialize_message`, for other encapsulations, which are
-                invalid otherwise, and for sequences of many strings. It needs the class.
+            deserialize: `rclpy.serialization.deserialize_message`, for other encapsulations than that
+                of little-endian CDR, which are refused otherwise, and for sequences of many strings. It
+                needs the class.
 
         Raises:
             ValueError: A field does not exist, or cannot be read on its own.
@@ -146,7 +145,7 @@ class Reader:
 
     def _read_new(self, data: bytes) -> tuple[Any, ...]:
         """Read a message whose layout is not known."""
-        if len(data) >= ENCAPSULATION and data[:2] not in PLAIN:
+        if len(data) >= ENCAPSULATION and data[:2] != LITTLE_ENDIAN:
             return self._read_message(data)
         most = math.inf if self._deserialize is None else _MAX_ELEMENTS
         try:
@@ -165,7 +164,10 @@ class Reader:
     def _read_message(self, data: bytes) -> tuple[Any, ...]:
         """Return the fields of a message object."""
         if self._deserialize is None:
-            raise self._undecodable()
+            raise DecodingError(
+                f'a {self._type.short_name} message must be little-endian CDR, which begins with 0001, '
+                f'if rclpy does not read it; it begins with {data[:2].hex()}'
+            )
         try:
             message = self._deserialize(data, self._class)
         except RuntimeError as error:
@@ -200,8 +202,7 @@ class _Walk:
         self._missing = set(fields)
         self._whole = whole
         self._offset = ENCAPSULATION
-        self._order = '>' if data[:2] == BIG_ENDIAN else '<'
-        self._format = [f'{self._order}2s']
+        self._format = ['<2s']
         self._formatted = 2
         self._values = 1
         self._lengths = [0]
@@ -340,7 +341,7 @@ class _Walk:
 
     def _length(self) -> int:
         self._align(COUNT.size)
-        (length,) = struct.unpack_from(f'{self._order}I', self._data, self._offset)
+        (length,) = struct.unpack_from('<I', self._data, self._offset)
         self._lengths.append(self._values)
         self._take('I', COUNT.size)
         self._values += 1

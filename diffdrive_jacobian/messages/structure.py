@@ -130,9 +130,8 @@ class Structure:
 FieldType: TypeAlias = Number | Text | Array | Sequence | Structure
 COUNT = Number('I')
 """The length of a string or of a sequence."""
-LITTLE_ENDIAN, BIG_ENDIAN = b'\x00\x01', b'\x00\x00'
-PLAIN = (LITTLE_ENDIAN, BIG_ENDIAN)
-"""First bytes of plain CDR, version 1."""
+LITTLE_ENDIAN = b'\x00\x01'
+"""First bytes of little-endian CDR, version 1."""
 ENCAPSULATION = 4
 """Bytes before the first field."""
 

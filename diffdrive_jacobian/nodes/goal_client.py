@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -266,33 +266,39 @@ class GoalClient(Node):  # type: ignore[misc]
     # --- Controllers
 
     def controllers(self) -> dict[bytes, str]:
-        """Map the publishers of goal_status, by GID, to the fully qualified names of their nodes.
+        """Map the controllers to the fully qualified names of their nodes.
 
-        Not every node that is subscribed to the goals is a controller. A name is empty while it is
-        unknown.
+        A controller is a node that is subscribed to the goals and publishes goal_status. It is known by
+        the GID of that publisher.
         """
-        topic = self.resolve_topic_name('goal_status')
+        readers = {node_of(reader) for reader in self._reachable()}
         return {
-            bytes(info.endpoint_gid): node_of(info) if is_named(info) else ''
-            for info in self.get_publishers_info_by_topic(topic)
+            bytes(info.endpoint_gid): node_of(info)
+            for info in self.get_publishers_info_by_topic(self.resolve_topic_name('goal_status'))
+            if is_named(info) and node_of(info) in readers
         }
+
+    def _reachable(self) -> list[Any]:
+        """Return the subscriptions to the goals.
+
+        One with transient local durability is never matched with this publisher.
+        """
+        topic = self.resolve_topic_name(self.topic)
+        return [
+            reader
+            for reader in self.get_subscriptions_info_by_topic(topic)
+            if reader.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL
+        ]
 
     def obstacle(self) -> str | None:
         """Describe what is missing before goals can be sent. None: nothing."""
         if self.get_clock().now().nanoseconds == 0:
             return 'use_sim_time is true, but nothing is published on /clock'
         topic, status = self.resolve_topic_name(self.topic), self.resolve_topic_name('goal_status')
-        readers = [
-            reader
-            for reader in self.get_subscriptions_info_by_topic(topic)
-            # A subscription with transient local durability is never matched with this publisher.
-            if reader.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL
-        ]
-        matched = self.readers
+        readers, matched = self._reachable(), self.readers
         if readers and matched < self._readers:
             return f'{topic} has {matched} of {self._readers} subscriptions'
-        publishers = self.get_publishers_info_by_topic(status)
-        if matched < len(readers) or not _nodes(readers) & _nodes(publishers):
+        if matched < len(readers) or not self.controllers():
             return (
                 f'no node is subscribed to {topic} and publishes {status}; is go_to_goal running, in '
                 'the same namespace and the same ROS_DOMAIN_ID?'
@@ -328,8 +334,3 @@ def driven_offset(values: Mapping[str, Any]) -> float:
     if values.get('controller') != 'offset_point' or not isinstance(offset, float):
         return 0.0
     return offset if math.isfinite(offset) else 0.0
-
-
-def _nodes(endpoints: Iterable[Any]) -> set[str]:
-    """Return the names of the nodes of endpoints, as far as they are known."""
-    return {node_of(endpoint) for endpoint in endpoints if is_named(endpoint)}

@@ -22,7 +22,7 @@ from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.runner import NodeRunner, ros_context, running
 from diffdrive_jacobian.ros.service_client import Liveness
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.text import listed, printable
 
 NAME, PATH_NAME = 'send_goal', 'send_path'
 """Names of the node that sends a goal and of the one that sends a path."""
@@ -53,6 +53,8 @@ class Result(Enum):
 
     NOT_SENT = auto()
     """No controller was discovered in time."""
+    SEVERAL = auto()
+    """Several controllers answered: it was not sent."""
     UNCONFIRMED = auto()
     """It was sent, but not acknowledged by every subscription."""
     SENT = auto()
@@ -84,8 +86,8 @@ class GoalResult:
     across: float | None = None
     """Greatest distance of the robot from the path (m). None: it was a goal, or was not driven along."""
     reason: str = ''
-    """For NOT_SENT what is missing, for LOST what happened to the controller; where it canceled, its
-    answer, which may say how far the robot rolls on."""
+    """For NOT_SENT what is missing, for SEVERAL the controllers, for LOST what happened to the
+    controller; where it canceled, its answer, which may say how far the robot rolls on."""
     canceled: bool | None = None
     """Whether the controller confirmed that it canceled the goal. None: it was not asked to."""
 
@@ -215,8 +217,6 @@ class _Session:
         self._runner = runner
         self._signals = signals
         self._progress = progress
-        self._duplicates: dict[str, float] = {}
-        self._warned: set[str] = set()
 
     def run(self, patience: float, timeout: float, *, follow: bool, heading_matters: bool) -> GoalResult:
         client, signals = self._client, self._signals
@@ -227,21 +227,37 @@ class _Session:
             return self._result(Result.NOT_SENT, reason=obstacle)
         self._await_readers()
         controllers = client.controllers()
-        client.send()
-        names = sorted(set(controllers.values()) - {''})
         parameters = HEADING_PARAMETERS if heading_matters else DRIVEN_POINT_PARAMETERS
-        liveness = Liveness(client, names, parameters, self._runner.seconds)
+        liveness = Liveness(client, set(controllers.values()), parameters, self._runner.seconds)
+        silent = 'the controller has not reported its parameters'
+        obstacle = self._wait(
+            PARAMETER_PATIENCE,
+            lambda: None if liveness.answering.total() >= len(controllers) else silent,
+            liveness,
+        )
+        if obstacle is not None and signals.count:
+            return self._result(Result.INTERRUPTED)
+        # DDS lists one that was killed for up to 20 s: only those that answer count.
+        answering = list(liveness.answering.elements())
+        if len(answering) > 1:
+            return self._result(
+                Result.SEVERAL,
+                reason=f'several controllers answer, {printable(listed(answering))}: each would drive '
+                'the robot; stop all but one, or give each a namespace',
+            )
+        self._use(liveness)
+        client.send()
+        for name, values in liveness.values.items():
+            if heading_matters and ignores_heading(values):
+                self._progress.heading_ignored(name)
         if not follow:
             acknowledged = self._await_acknowledgement()
-            if heading_matters:
-                self._learn_parameters(liveness)
             return self._result(Result.SENT if acknowledged else Result.UNCONFIRMED)
         missing = f'no answer on {client.resolve_topic_name("goal_status")}'
         if self._wait(ANSWER_PATIENCE, lambda: None if client.status else missing, liveness):
             if signals.count:
                 return self._cancel(Result.INTERRUPTED)
             return self._result(Result.NO_ANSWER)
-        self._learn_parameters(liveness)
         lost = self._follow(liveness, controllers, timeout)
         if client.ended:
             return self._result(Result.ENDED)
@@ -300,22 +316,10 @@ class _Session:
             self._progress.waiting(f'not every subscription to {topic} has acknowledged the goal')
         return True
 
-    def _learn_parameters(self, liveness: Liveness) -> None:
-        """Wait until the controller has reported which point of the robot it drives.
-
-        If the heading of the goal matters, report a controller that ignores it.
-        """
-        missing = 'the controller has not reported its parameters'
-        self._wait(PARAMETER_PATIENCE, lambda: None if liveness.answered else missing, liveness)
-        self._use(liveness)
-        for name, values in sorted(liveness.values.items()):
-            if ignores_heading(values):
-                self._progress.heading_ignored(name)
-
     def _use(self, liveness: Liveness) -> None:
-        """Use the parameters that the first controller has reported last."""
-        for name in sorted(liveness.values)[:1]:
-            self._client.arrival = Arrival(offset=driven_offset(liveness.values[name]))
+        """Use the parameters that the controller has reported last."""
+        for values in liveness.values.values():
+            self._client.arrival = Arrival(offset=driven_offset(values))
 
     def _follow(
         self, liveness: Liveness, controllers: Mapping[bytes, str], timeout: float
@@ -349,27 +353,10 @@ class _Session:
                 break
             if now - queried >= DISCOVERY_PERIOD:
                 queried, present = now, client.controllers()
-            partial_silence = liveness.partial_silence()
-            lost = loss(controllers, present, silence, partial_silence)
+            lost = loss(controllers, present, silence)
             if lost is not None:
                 return lost
-            self._warn_of_duplicates(duplicates(controllers, present), partial_silence, now)
         return None
-
-    def _warn_of_duplicates(
-        self, names: Sequence[str], partial_silence: Mapping[str, float], now: float
-    ) -> None:
-        """Log once for each name that another node has it, when it is no restarted controller."""
-        self._duplicates = {name: self._duplicates.get(name, now) for name in names}
-        for name, since in self._duplicates.items():
-            restarted = partial_silence.get(name, 0.0) > DISCOVERY_PERIOD
-            if now - since >= SILENCE and not restarted and name not in self._warned:
-                self._warned.add(name)
-                self._client.get_logger().warning(
-                    f'another node named {printable(name)} publishes '
-                    f'{self._client.resolve_topic_name("goal_status")}: two controllers may drive the '
-                    'robot; give them different names'
-                )
 
     def _cancel(self, result: Result) -> GoalResult:
         """Cancel the goal, and wait until that is confirmed, or for another signal."""
@@ -422,45 +409,26 @@ def ignores_heading(values: Mapping[str, Any]) -> bool:
     )
 
 
-def loss(
-    sent_to: Mapping[bytes, str],
-    present: Mapping[bytes, str],
-    silence: float,
-    partial_silence: Mapping[str, float],
-) -> str | None:
+def loss(sent_to: Mapping[bytes, str], present: Mapping[bytes, str], silence: float) -> str | None:
     """Describe why the controller of a goal is lost. None: it is not.
 
     Args:
         sent_to: The controllers to which the goal was sent, as from `GoalClient.controllers`.
         present: The controllers that are present now.
-        silence: As of `Liveness`.
-        partial_silence: Likewise.
+        silence: As of `Liveness` (s).
     """
-    namesakes = _namesakes(sent_to, present)
+    later = {name for gid, name in present.items() if gid not in sent_to}
+    for name in sorted(later & set(sent_to.values())):
+        return (
+            f'another controller {printable(name)} has started: the one with the goal was restarted, or '
+            'two drive the robot'
+        )
     if not sent_to.keys() & present.keys():
-        if namesakes:
-            return f'the controller {namesakes[0]} was restarted'
         return 'the controller is gone'
     if silence >= SILENCE:
-        names = ', '.join(sorted(set(sent_to.values()) - {''}))
+        names = ', '.join(sorted(set(sent_to.values())))
         return f'the controller {names} has not answered for {SILENCE:g} s: it was killed or hangs'
-    # DDS may list one that was killed for 20 s more, beside its successor, which answers alone.
-    for name in namesakes:
-        if partial_silence.get(name, 0.0) >= SILENCE:
-            return f'the controller {name} was restarted'
     return None
-
-
-def duplicates(sent_to: Mapping[bytes, str], present: Mapping[bytes, str]) -> list[str]:
-    """Return the names of controllers of a goal that other nodes have as well, sorted."""
-    remaining = {gid: name for gid, name in sent_to.items() if gid in present}
-    return [name for name in _namesakes(sent_to, present) if name in remaining.values()]
-
-
-def _namesakes(sent_to: Mapping[bytes, str], present: Mapping[bytes, str]) -> list[str]:
-    """Return the names that later controllers share with those of the goal, sorted."""
-    later = {present[gid] for gid in present.keys() - sent_to.keys()}
-    return sorted(later & set(sent_to.values()) - {''})
 
 
 class Standstill:

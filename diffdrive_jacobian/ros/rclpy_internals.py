@@ -23,13 +23,13 @@ from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
-from rclpy.executors import Executor, TimeoutException
+from rclpy.executors import Executor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import HistoryPolicy, QoSProfile, qos_profile_default
+from rclpy.qos import HistoryPolicy, QoSProfile
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.task import Task
@@ -543,15 +543,6 @@ def queue_depth(profile: QoSProfile) -> int:
     return sys.maxsize if profile.history == HistoryPolicy.KEEP_ALL else max(profile.depth, 1)
 
 
-def longest_queue(node: Node) -> int:
-    """Return the largest number of messages that wait in a queue of a node.
-
-    Queues inside waitables, such as those of actions, are taken to have the default depth of rclpy.
-    """
-    entities = (*node.subscriptions, *node.services, *node.clients)
-    return max(map(queue_depth, [*(one.qos_profile for one in entities), qos_profile_default]))
-
-
 def requires_wait_set(node: Node) -> bool:
     """Return whether a node has callbacks that the EventsExecutor of Jazzy does not support.
 
@@ -568,32 +559,6 @@ def requires_wait_set(node: Node) -> bool:
     entities = (*node.subscriptions, *node.services)
     coroutines = any(inspect.iscoroutinefunction(entity.callback) for entity in entities)
     return with_info or coroutines or any(True for _ in node.guards)
-
-
-def execute_ready(executor: Executor) -> bool:
-    """Execute the next callback that is ready on a SingleThreadedExecutor, without waiting.
-
-    It goes in rounds. At the beginning of each it looks which entities are ready, and then executes one
-    callback of each of them. Return whether a callback was executed, or else the round is over.
-    Relies on `wait_for_ready_callbacks`, which is documented for executors of users.
-    """
-    try:
-        task, *_ = executor.wait_for_ready_callbacks(timeout_sec=0)
-    except TimeoutException:
-        return False
-    task()
-    if (error := task.exception()) is not None:
-        raise error
-    return True
-
-
-def has_tasks(executor: Executor) -> bool:
-    """Return whether a SingleThreadedExecutor has tasks that are not done, such as coroutines that wait.
-
-    It continues those of a node only while it has the node.
-    Relies on `Executor._tasks`.
-    """
-    return any(not (task.done() or task.cancelled()) for task, *_ in list(executor._tasks))
 
 
 def new_task(function: Any, arguments: tuple[Any, ...], keywords: dict[str, Any], executor: Any) -> Task:

@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 from diffdrive_jacobian.messages.codecs import GOALS_HEADER, PATH_HEADER, Codec
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.structure import PLAIN
+from diffdrive_jacobian.messages.structure import LITTLE_ENDIAN
 from diffdrive_jacobian.ros.rclpy_internals import request_message_info
 
 V = TypeVar('V')
@@ -137,10 +137,10 @@ def poses_header(data: bytes, kind: type[Any]) -> tuple[Time, int]:
         DecodingError: The bytes end before the poses, or are too few for them. Or it takes message
             objects to read them, and they are too many for that.
     """
-    if data[:2] not in PLAIN and len(data) > MAX_OTHER_ENCAPSULATION:
+    if data[:2] != LITTLE_ENDIAN and len(data) > MAX_OTHER_ENCAPSULATION:
         raise DecodingError(
             f'a {kind.__name__} message must have at most {MAX_OTHER_ENCAPSULATION} bytes, unless it is '
-            f'plain CDR, got {len(data)}'
+            f'little-endian CDR, got {len(data)}'
         )
     sec, nanosec, count = _read_header[kind](data)
     return Time(sec=sec, nanosec=nanosec), count

@@ -133,19 +133,15 @@ class Liveness:
         self._clients = {
             name: node.create_client(GetParameters, f'{name}/get_parameters') for name in names
         }
-        self._node = node
         self._monotonic = monotonic
-        self._answers: dict[str, Counter[int]] = {name: Counter() for name in self._clients}
-        self._partial_silence = dict.fromkeys(self._clients, 0.0)
-        self._servers = dict.fromkeys(self._clients, 0)
-        self._together: set[str] = set()
+        self._responses: dict[str, Counter[int]] = {name: Counter() for name in self._clients}
         for name, client in self._clients.items():
             on_response(client, partial(self._on_response, name))
         self._parameters = tuple(parameters)
         self._pending: deque[tuple[Any, Any]] = deque()
         self._silence = 0.0
-        self.answered = False
-        """Whether any of the nodes has answered."""
+        self.answering: Counter[str] = Counter()
+        """How many nodes of each name have answered the same request."""
         self._updated = monotonic()
         self._requested = -math.inf
         self.values: dict[str, dict[str, Any]] = {}
@@ -158,46 +154,25 @@ class Liveness:
         which this process itself was held up does not count either.
         """
         now = self._monotonic()
-        if self.answered:
-            step = min(now - self._updated, LONGEST_STEP)
-            self._silence += step
-            for name in self._partial_silence:
-                self._partial_silence[name] += step
+        if self.answering:
+            self._silence += min(now - self._updated, LONGEST_STEP)
         self._updated = now
         if now - self._requested >= PERIOD:
             self._requested = now
             self._request()
         return self._silence
 
-    def partial_silence(self) -> dict[str, float]:
-        """Return for how long fewer nodes of each name have answered than the graph lists (s).
-
-        DDS lists a node that was killed beside its successor of the same name, but only one of them
-        answers. It is 0 once several nodes of the name have answered the same request: they are
-        different nodes, and which of them falls silent later is unknown.
-        """
-        return {
-            name: 0.0 if name in self._together else silence
-            for name, silence in self._partial_silence.items()
-        }
-
     def _on_response(self, name: str, request: int) -> None:
-        answers = self._answers[name]
-        answers[request] += 1
-        if answers[request] > 1:
-            self._together.add(name)
-        if answers[request] >= self._servers[name]:
-            self._partial_silence[name] = 0.0
-        while len(answers) > PENDING:
-            del answers[min(answers)]
+        self._silence = 0.0
+        responses = self._responses[name]
+        responses[request] += 1
+        if responses[request] > 1:
+            self.answering[name] = max(self.answering[name], responses[request])
+        while len(responses) > PENDING:
+            del responses[min(responses)]
 
     def _request(self) -> None:
         for name, client in self._clients.items():
-            servers = self._node.count_services(client.srv_name)
-            if servers > self._servers[name]:
-                # A new one has as long to answer as the others.
-                self._partial_silence[name] = 0.0
-            self._servers[name] = servers
             if client.service_is_ready():
                 future = client.call_async(GetParameters.Request(names=self._parameters))
                 future.add_done_callback(partial(self._on_answer, name))
@@ -207,8 +182,7 @@ class Liveness:
             client.remove_pending_request(future)
 
     def _on_answer(self, name: str, future: Any) -> None:
-        self.answered = True
-        self._silence = 0.0
+        self.answering[name] = max(self.answering[name], 1)
         if future.cancelled() or future.exception() is not None:
             return
         values = future.result().values

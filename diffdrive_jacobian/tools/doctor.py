@@ -11,11 +11,8 @@ from diffdrive_jacobian.diagnosis.graph import Graph, Participant, Problem, chec
 from diffdrive_jacobian.diagnosis.machine import (
     Environment,
     check_environment,
-    check_network,
     check_shared_memory,
     environment,
-    interfaces,
-    multicast_error,
     shared_memory,
 )
 from diffdrive_jacobian.errors import UserError
@@ -55,11 +52,9 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     found = environment()
     if not options.json:
         print(*_heading(found), sep='\n', flush=True)
-    multicast = multicast_error() if found.reach == 'SUBNET' else ''
     findings = list(check_environment(found))
     usable = not any(one.problem for one in findings)
     findings += check_shared_memory(shared_memory())
-    findings += check_network(interfaces(), found.reach, multicast)
     rmw, graph = '', Graph()
     if usable:
         try:
@@ -160,8 +155,8 @@ def _parser() -> _cli.Parser:
         usage=f'{PROGRAM} [options] [--ros-args ...]',
         description='Report which nodes run, who communicates with whom, and what prevents it: types '
         'and quality of service that do not match, topics that nobody reads or publishes, several '
-        'publishers, clocks, discovery, versions, shared memory and network. Each problem is named with '
-        'its remedy. Exit code 0: no problem was found; 1: there are problems; 2: wrong arguments; 130: '
+        'publishers, clocks, discovery, versions and shared memory. Each problem is named with its '
+        'remedy. Exit code 0: no problem was found; 1: there are problems; 2: wrong arguments; 130: '
         'interrupted.',
     )
     parser.add_timeout('duration of the discovery and of the observation (s)', default=DISCOVERY)

@@ -128,6 +128,7 @@ def report(result: GoalResult, options: argparse.Namespace, what: str) -> list[s
     }
     lines = {
         Result.NOT_SENT: f'not sent within {options.wait:g} s: {result.reason}',
+        Result.SEVERAL: f'not sent: {result.reason}',
         Result.UNCONFIRMED: f'sent, but not acknowledged by every subscription to {result.topic}',
         Result.SENT: f'sent: {what} on {result.topic}',
         Result.NO_ANSWER: f'no answer: the controller published no goal_status within '

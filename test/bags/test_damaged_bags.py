@@ -291,7 +291,7 @@ def test_messages_that_cannot_be_decoded_leave_the_bag_readable(whole, tmp_path)
             'AND timestamp < ?',
             (b'\0\1\0\0xyz', round(1.15 * SECOND)),
         )
-    note = f'3 of {COUNT} messages on /odom cannot be decoded'
+    note = f'3 of {COUNT} messages on /odom cannot be decoded as little-endian CDR'
     assert verify(read_run(bag)).notes[0] == f'{note} and were skipped'
     with pytest.raises(UncheckedError) as caught:
         recover(bag)

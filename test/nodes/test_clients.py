@@ -27,16 +27,17 @@ from diffdrive_jacobian.nodes.remote_goal import (
     RemoteProgress,
     Result,
     Standstill,
-    duplicates,
     loss,
     send_goal,
 )
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros import serialization
+from diffdrive_jacobian.ros.runner import Runner
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
-from diffdrive_jacobian.ros.service_client import LONGEST_STEP, PENDING, PERIOD, Liveness
+from diffdrive_jacobian.ros.service_client import LONGEST_STEP, PENDING, Liveness
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.text import listed
 from diffdrive_jacobian.tools import send_goal as sending
 
 
@@ -110,7 +111,7 @@ def test_distance_is_that_of_the_point_the_controller_drives(ros):
     assert client.distance == 0.75
     assert node.arrival.offset == driven_offset(watch.values['/go_to_goal'])
     # A node without these parameters answers without values.
-    ros.until(lambda: unknown.silence() is None or unknown.answered, 'an answer')
+    ros.until(lambda: unknown.silence() is None or unknown.answering, 'an answer')
     assert unknown.values == {}
     for values in (
         {},
@@ -147,12 +148,12 @@ def watch(ros, clock):
 
 def answered(ros, watch, clock):
     """Wait for another answer: the silence ends."""
-    watch.answered = False
+    watch.answering.clear()
 
     def over():
         clock.now += 0.1
         watch.silence()
-        return watch.answered
+        return watch.answering
 
     ros.until(over, 'an answer')
 
@@ -192,78 +193,50 @@ def test_a_node_without_parameter_services_is_never_silent(ros, clock, watch):
 
 A, B, OTHER = b'a', b'b', b'o'
 ONE, TWO = {A: '/go_to_goal'}, {A: '/go_to_goal', B: '/go_to_goal'}
-RESTARTED = 'the controller /go_to_goal was restarted'
+ANOTHER = (
+    'another controller /go_to_goal has started: the one with the goal was restarted, or two drive the '
+    'robot'
+)
 HANGS = 'the controller /go_to_goal has not answered for 3 s: it was killed or hangs'
 
 
-def test_loss_and_duplicates():
-    for sent_to, present, silence, partial, expected in (
-        (ONE, ONE, 2.9, 2.9, None),
-        (ONE, {}, 0.0, 0.0, 'the controller is gone'),
-        (ONE, {OTHER: '/other'}, 0.0, 0.0, 'the controller is gone'),
-        (ONE, {**ONE, OTHER: '/other'}, 0.0, 9.0, None),
-        ({A: ''}, {A: '', OTHER: ''}, 0.0, 0.0, None),
-        (ONE, TWO, 0.0, 2.9, None),
-        (TWO, TWO, 0.0, 9.0, None),
-        (ONE, TWO, 0.0, 3.0, RESTARTED),
-        (ONE, {B: '/go_to_goal'}, 0.0, 0.0, RESTARTED),
-        (ONE, ONE, 3.0, 3.0, HANGS),
+def test_loss():
+    for sent_to, present, silence, expected in (
+        (ONE, ONE, 2.9, None),
+        (ONE, {}, 0.0, 'the controller is gone'),
+        (ONE, {OTHER: '/other'}, 0.0, 'the controller is gone'),
+        (ONE, {**ONE, OTHER: '/other'}, 0.0, None),
+        # One of them was killed before, or the goal was not sent.
+        (TWO, TWO, 0.0, None),
+        (TWO, ONE, 0.0, None),
+        (ONE, TWO, 0.0, ANOTHER),
+        (ONE, {B: '/go_to_goal'}, 0.0, ANOTHER),
+        (ONE, ONE, 3.0, HANGS),
     ):
-        assert loss(sent_to, present, silence, {'/go_to_goal': partial}) == expected
-    for present in (ONE, {**ONE, OTHER: '/other'}, {B: '/go_to_goal'}):
-        assert duplicates(ONE, present) == []
-    assert duplicates(ONE, TWO) == ['/go_to_goal']
+        assert loss(sent_to, present, silence) == expected
 
 
-def partial_silence(ros, watch, clock, seconds):
-    """Spin while some node answers, for a time of the clock; return the partial silence."""
-    end = clock.now + seconds
-
-    def over():
-        clock.now += 0.05
-        watch.silence()
-        return clock.now >= end
-
-    ros.until(over, 'the end')
-    return watch.partial_silence()['/go_to_goal']
-
-
-def two_are_discovered(ros):
-    count = ros.peer.count_services
-    ros.until(lambda: count('/go_to_goal/get_parameters') == 2, 'both are discovered')
+@pytest.mark.parametrize('names', [('/go_to_goal', '/go_to_goal'), ('/first', '/second')])
+def test_a_goal_is_not_sent_to_several_controllers_that_answer(ros, names):
+    for name in names:
+        ros.add(GoToGoal, cli_args=['--ros-args', '-r', f'__node:={name[1:]}'])
+    received = ros.listen(PoseStamped, 'goal_pose')
+    result = send_goal([1.0, 0.0, 0.0], runner=Runner(ros.context, ros.executor))
+    assert result.result is Result.SEVERAL
+    assert result.reason == (
+        f'several controllers answer, {listed(list(names))}: each would drive the robot; stop all but '
+        'one, or give each a namespace'
+    )
+    assert not received
 
 
-def test_a_duplicate_that_answers_too_is_no_restart(ros, clock, watch):
+def test_a_controller_that_does_not_answer_does_not_count(ros):
+    corpse = ros.add(GoToGoal)
+    ros.executor.remove_node(corpse)
     ros.add(GoToGoal)
-    answered(ros, watch, clock)
-    twin = ros.add(GoToGoal)
-    two_are_discovered(ros)
-    ros.until(lambda: partial_silence(ros, watch, clock, PERIOD) == 0.0, 'both have answered')
-    # Which of them falls silent now is unknown.
-    ros.executor.remove_node(twin)
-    assert partial_silence(ros, watch, clock, 2 * SILENCE) == 0.0
-
-
-def test_a_successor_that_answers_alone_is_a_restart(ros, clock, watch):
-    old = ros.add(GoToGoal)
-    answered(ros, watch, clock)
-    ros.executor.remove_node(old)
-    ros.add(GoToGoal)
-    two_are_discovered(ros)
-    assert partial_silence(ros, watch, clock, 2 * SILENCE) >= SILENCE
-    assert watch.silence() < SILENCE
-
-
-def test_a_second_controller_is_distinguished_from_the_one_that_has_the_goal(ros):
-    sender = add_client(ros, [[1.0, 1.0, 0.0]], topic='goal_pose', start_parameter_services=False)
-    ros.add(GoToGoal, namespace='/here')
-    ros.add(GoToGoal)
-    ros.until(lambda: sender.obstacle() is None, 'the sender is ready')
-    controllers = sender.controllers()
-    assert list(controllers.values()) == ['/go_to_goal']
-    ros.add(GoToGoal)
-    ros.until(lambda: len(sender.controllers()) == 2, 'it has a namesake')
-    assert duplicates(controllers, sender.controllers()) == ['/go_to_goal']
+    ros.until(lambda: ros.peer.count_publishers('goal_status') == 2, 'both are discovered')
+    result = send_goal([1.0, 0.0, 0.0], runner=Runner(ros.context, ros.executor), follow=False)
+    assert result.acknowledged
 
 
 # --- Robots that have a goal and do not move
@@ -315,6 +288,8 @@ def test_the_report_does_not_claim_that_an_unknown_robot_was_stopped(capsys):
     ]
     known = GoalResult(**values, canceled=True, distance=1.0)
     assert sending.report(known, options, 'goal (1, 1)')[1] == 'canceled: the robot was stopped'
+    several = GoalResult(result=Result.SEVERAL, topic='/goal_pose', reason='several answer')
+    assert sending.report(several, options, 'goal (1, 1)') == ['not sent: several answer']
     sending.Progress('send_goal', 'goal (1, 1)').standing(5.0)
     assert capsys.readouterr().out == 'the robot has not moved for 5 s: call doctor to find out why\n'
 

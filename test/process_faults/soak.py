@@ -50,8 +50,8 @@ EXPECTED = (
     *('pose set to ', 'goal accepted', 'goal reached', 'goal canceled', 'goal refused', 'goal aborted'),
     *(' dropped: ', 'the wheels are stopped', 'no command on ', 'no valid odometry on '),
     *('odometry is received again', 'the goal waits for odometry', 'drives the robot by '),
-    *('arrive faster than they are handled', 'are handled in time again'),
-    *('their poses alternate', 'their commands alternate', 'is subscribed to ', 'publishes '),
+    *('arrive faster than they are handled', 'their poses alternate', 'their commands alternate'),
+    *('is subscribed to ', 'publishes '),
     *('was an int assigned to a float field', 'spirals', 'cannot be reached', 'the gain', 'kp', 'kv'),
     'half a turn takes more than',
     # The code that rclpy generates for a type writes this itself.

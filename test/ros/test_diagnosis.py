@@ -23,13 +23,10 @@ from diffdrive_jacobian.diagnosis.machine import (
     ROS_PACKAGES,
     WHEELS,
     Environment,
-    Interface,
     SharedMemory,
     check_environment,
-    check_network,
     check_shared_memory,
     environment,
-    interfaces,
     shared_memory,
 )
 from diffdrive_jacobian.text import listed
@@ -210,24 +207,6 @@ def test_full_shared_memory_is_a_problem_and_stale_segments_are_a_note():
     check(check_shared_memory(replace(memory, free=1000)), 'is full: 1.0 kB of 1.0 GB are free')
     for missing in (None, replace(memory, writable=False)):
         assert found(check_shared_memory(missing))[1] == 0
-
-
-LOOPBACK = Interface('lo', up=True, loopback=True, multicast=False)
-WIRED = Interface('eth0', up=True, loopback=False, multicast=True)
-
-
-def test_loopback_and_multicast_are_checked():
-    deaf = LOOPBACK, replace(WIRED, multicast=False)
-    check(check_network((LOOPBACK, WIRED), 'SUBNET', ''), '', 0)
-    check(check_network((), 'SUBNET', ''), '', 0)
-    down = replace(LOOPBACK, up=False), WIRED
-    check(check_network(down, 'LOCALHOST', ''), 'loopback interface is down')
-    check(check_network(deaf, 'SUBNET', ''), 'no network interface has multicast (eth0)')
-    # On this machine multicast is not needed.
-    assert found(check_network(deaf, 'LOCALHOST', ''))[1] == 0
-    silent = check_network((LOOPBACK, WIRED), 'SUBNET', 'no message arrives')
-    assert 'does not work (no message' in found(silent)[0]
-    assert any(one.loopback for one in interfaces())
 
 
 # --- Environment

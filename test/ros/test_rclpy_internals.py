@@ -267,12 +267,14 @@ def test_entities_of_a_node_are_counted(node):
     node.create_timer(1.0, lambda: None)
     node.create_client(GetParameters, 'get')
     assert internals.entity_count(node) == before + 2
-    node.create_subscription(String, 'words', [].append, 2000)
+    node.create_subscription(String, 'words', [].append, 10)
     # With its QoS events.
     assert internals.entity_count(node) > before + 2
-    assert internals.longest_queue(node) == 2000
-    node.create_subscription(String, 'all', [].append, QoSProfile(history=HistoryPolicy.KEEP_ALL))
-    assert internals.longest_queue(node) == sys.maxsize
+
+
+def test_a_queue_without_a_limit_has_the_greatest_depth():
+    assert internals.queue_depth(QoSProfile(depth=3)) == 3
+    assert internals.queue_depth(QoSProfile(history=HistoryPolicy.KEEP_ALL)) == sys.maxsize
 
 
 def test_a_task_runs_to_the_next_await_when_it_is_called(ros):
