@@ -18,7 +18,7 @@ COMMANDS = (
     ('run.py', '--quick'),
     ('calibration_cases.py', '--robots', '1', 'UMBmark'),
     ('explore_defects.py', '--worlds', '50', 'divides by distance'),
-    ('drift.py', '--seeds', '20', '--rounds', '1', '--limited'),
+    ('drift.py', '--seeds', '20', '--limited'),
     ('inverse_kinematics.py', '--quick'),
     ('limiter.py',),
     ('overshoot.py', '--quick'),
