@@ -25,7 +25,6 @@ from diffdrive_jacobian.exploration.processes import (
     LocalExecutor,
     SerialExecutor,
     packed,
-    run_world,
     run_worlds,
 )
 from diffdrive_jacobian.exploration.result import Exploration, Finding
@@ -373,7 +372,7 @@ class Search:
         """Run a world, in a new process if `afresh`, unless worlds are to run in this thread."""
         data = packed(self.setting, [trial], only=index, digest=digest)
         afresh = afresh and not isinstance(self.executor, SerialExecutor)
-        (outcome,) = self._result(self.executor.submit(run_world if afresh else run_worlds, data))
+        (outcome,) = self._result(self.executor.submit(run_worlds, data, afresh=afresh))
         return outcome
 
     def time_left(self) -> float:

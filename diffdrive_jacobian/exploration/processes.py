@@ -40,35 +40,46 @@ class ChildDiedError(DiffdriveError):
 
 
 class ChildProcess:
-    """A Python process that executes functions in its main thread."""
+    """A Python process that executes functions in its main thread.
+
+    It starts with a call, if there is none or it has ended.
+    """
 
     def __init__(self) -> None:
-        """Start the process."""
-        self._connection, theirs = Pipe()
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, '-m', MODULE, str(theirs.fileno())],
-                stdin=subprocess.DEVNULL,
-                # What nodes print must not mix with what the program prints about them.
-                stdout=2,
-                pass_fds=[theirs.fileno()],
-                # Ctrl-C in a terminal is for this process, which ends the child.
-                start_new_session=True,
-                env={**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))},
-            )
+        """Start no process yet."""
+        self._process: subprocess.Popen[bytes] | None = None
+        self.closed = False
+        """Whether none may be started any more."""
 
     def call(self, function: Any, *args: Any) -> Any:
         """Call a function of a module in the process, and return what it returns.
 
         Raises:
-            ChildDiedError: The process ended.
+            ChildDiedError: The process ended. The next call starts another one.
             Exception: What the function raises.
         """
+        process = self._process
+        if process is None or process.returncode is not None:
+            self._connection, theirs = Pipe()
+            with theirs:
+                self._process = process = subprocess.Popen(
+                    [sys.executable, '-m', MODULE, str(theirs.fileno())],
+                    stdin=subprocess.DEVNULL,
+                    # What nodes print must not mix with what the program prints about them.
+                    stdout=2,
+                    pass_fds=[theirs.fileno()],
+                    # Ctrl-C in a terminal is for this process, which ends the child.
+                    start_new_session=True,
+                    env={**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))},
+                )
+            if self.closed:
+                # Another thread has ended the one before.
+                self.end()
         try:
             self._connection.send((function, args))
             failed, result = self._connection.recv()
         except (EOFError, ConnectionError):
-            code = self._process.wait()
+            code = process.wait()
             how = f'was ended by signal {-code}' if code < 0 else f'ended with exit code {code}'
             raise ChildDiedError(f'the process of the world {how}') from None
         except BaseException:
@@ -79,60 +90,35 @@ class ChildProcess:
             raise result
         return result
 
-    @property
-    def ended(self) -> bool:
-        """Whether the process has ended."""
-        return self._process.returncode is not None
-
     def end(self) -> None:
         """End the process. A call in another thread raises ChildDiedError."""
-        self._process.kill()
-        self._process.wait()
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
 
     def __del__(self) -> None:
         """End the process with the thread that it belongs to."""
-        if hasattr(self, '_process'):
-            self.end()
-
-
-class Children(set[ChildProcess]):
-    """The processes of an executor."""
-
-    closed = False
-    """Whether no more may be started."""
+        self.end()
 
 
 _of_thread = threading.local()
 
 
-def own_children(children: Children) -> None:
-    """Keep the process of this thread in a set, as long as it lives."""
-    _of_thread.children = children
-
-
 def call_in_child(function: Any, *args: Any, afresh: bool = False) -> Any:
-    """Call a function in the process of this thread, or in a new one that ends afterwards.
+    """Call a function in the process of this thread, or in a new one that ends afterwards if `afresh`.
 
     Raises:
         ChildDiedError: The process ended. The next call starts another one.
         Exception: What the function raises.
     """
-    children: Children = _of_thread.__dict__.setdefault('children', Children())
-    child: ChildProcess | None = None if afresh else getattr(_of_thread, 'child', None)
-    if child is None or child.ended:
-        if children.closed:
-            raise ChildDiedError('the executor was shut down')
-        child = ChildProcess()
-        children.add(child)
-        if not afresh:
-            _of_thread.child = child
+    child: ChildProcess = _of_thread.__dict__.setdefault('child', ChildProcess())
+    if not afresh:
+        return child.call(function, *args)
+    child.end()
     try:
         return child.call(function, *args)
     finally:
-        if afresh:
-            child.end()
-        if child.ended:
-            children.discard(child)
+        child.end()
 
 
 # --- In the process
@@ -200,30 +186,28 @@ def can_run_here() -> bool:
     return threading.current_thread() is threading.main_thread() and not rclpy.ok()
 
 
-def run_worlds(data: bytes) -> list[Outcome]:
+def run_worlds(data: bytes, *, afresh: bool = False) -> list[Outcome]:
     """Run `packed` worlds, in this process if it can run a `Lockstep`, else in one of its own.
+
+    Args:
+        data: The worlds.
+        afresh: Whether to run them, each, in a new process. That one ends it is a finding.
 
     Raises:
         ExplorationError: The scenario cannot be imported, or a fault or property is invalid.
     """
-    if can_run_here():
+    if can_run_here() and not afresh:
         return _run_here(data)
-    try:
-        return list(call_in_child(_run_here, data))
-    except ChildDiedError:
-        # One of the worlds has ended it.
-        setting, trials, only, digest = pickle.loads(data)
-        alone = (packed(setting, [trial], only=only, digest=digest) for trial in trials)
-        return [run_world(one, afresh=False)[0] for one in alone]
-
-
-def run_world(data: bytes, *, afresh: bool = True) -> list[Outcome]:
-    """Run one `packed` world in a process, in a new one if `afresh`. That it ends it is a finding."""
     try:
         return list(call_in_child(_run_here, data, afresh=afresh))
     except ChildDiedError as error:
-        died = Violation(key=str(error), seconds=0.0, text=str(error), name=DIED)
-        return [Outcome(violations=(died,))]
+        setting, trials, only, digest = pickle.loads(data)
+        if afresh:
+            died = Violation(key=str(error), seconds=0.0, text=str(error), name=DIED)
+            return [Outcome(violations=(died,))]
+        # One of the worlds has ended it.
+        alone = (packed(setting, [trial], only=only, digest=digest) for trial in trials)
+        return [run_worlds(one, afresh=True)[0] for one in alone]
 
 
 def _run_here(data: bytes) -> list[Outcome]:
@@ -247,8 +231,8 @@ class LocalExecutor(ThreadPoolExecutor):
         Args:
             workers: Number of processes; None: one for each core that this process may use.
         """
-        self._children = Children()
-        super().__init__(workers or _cores(), initializer=own_children, initargs=(self._children,))
+        self._children: list[ChildProcess] = []
+        super().__init__(workers or _cores(), initializer=_own_child, initargs=(self._children,))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, also those that are running a world if `cancel_futures` is true."""
@@ -260,9 +244,15 @@ class LocalExecutor(ThreadPoolExecutor):
             self._end_children()
 
     def _end_children(self) -> None:
-        self._children.closed = True
-        for child in list(self._children):
+        for child in self._children:
+            child.closed = True
             child.end()
+
+
+def _own_child(children: list[ChildProcess]) -> None:
+    """Give this thread a process that the executor can end."""
+    _of_thread.child = ChildProcess()
+    children.append(_of_thread.child)
 
 
 class SerialExecutor(Executor):

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from diffdrive_jacobian import __version__
-from diffdrive_jacobian.exploration.processes import packed, run_world, run_worlds
+from diffdrive_jacobian.exploration.processes import packed, run_worlds
 from diffdrive_jacobian.exploration.scenario import ExplorationError, Source
 from diffdrive_jacobian.exploration.trial import (
     DIED,
@@ -184,7 +184,7 @@ class Exploration:
         found = finding.violation
         data = packed(finding.setting, [finding.trial], only=found.index, digest=True)
         # A world that ends its process must not end this one.
-        (outcome,) = (run_world if found.name == DIED else run_worlds)(data)
+        (outcome,) = run_worlds(data, afresh=found.name == DIED)
         return Replay.compared(
             outcome.of(found.key),
             outcome.digest,

@@ -26,7 +26,6 @@ NOTHING_TO_DO = 3
 
 
 def test_killed_while_it_records_or_makes_the_bag(world, tmp_path, capsys):
-    """`benchmark/crash.py` kills it 20 times with each storage."""
     control = Control(world)
     loss, _ = crash(control, tmp_path / 'run', 'mcap', 0.2, lambda path: recover(capsys, path)[0])
     assert loss <= ALLOWED_LOSS

@@ -4,8 +4,7 @@ CPU: robot and controller (and bridge) beside bare nodes that send the same mess
 time of the process over the odometry messages that the controller received. Latency: a prober in the
 controller's process publishes odometry by a timer and receives the command; from before publish() to the
 callback, median of all. Executors: `events` and `single` are spun as our runner does it, `rclpy.spin` is
-rclpy's own, on the SingleThreadedExecutor. The `limited` robot has acceleration limits and a lag. Each
-figure comes from a process of its own.
+rclpy's own, on the SingleThreadedExecutor. Each figure comes from a process of its own.
 """
 
 from __future__ import annotations
@@ -35,11 +34,9 @@ class Side(NamedTuple):
 
 
 _OURS, _BARE = str(Side('our', 'events')), str(Side('bare', 'events'))
-_LIMITED = str(Side('limited', 'events'))
 GOALS = {
     ('cpu', _OURS, _BARE, 500.0): Goal(0.5),
     ('latency', _OURS, _BARE, 500.0): Goal(0.6),
-    ('cpu', _LIMITED, _OURS, 50.0): Goal(2.0),
 }
 """Goals by function, side, reference and rate."""
 
@@ -48,10 +45,9 @@ def cpu(nodes: str, executor: str, bridge: bool, rate: float, seconds: float) ->
     """Measure CPU per odometry message (us)."""
     import sides
 
-    with _spinning(executor, guarded=nodes in ('our', 'limited')) as (context, spin):
-        if nodes in ('our', 'limited'):
-            limits = sides.LIMITS if nodes == 'limited' else {}
-            made = sides.our_nodes(rate=rate, bridge=bridge, limits=limits, context=context)
+    with _spinning(executor, guarded=nodes == 'our') as (context, spin):
+        if nodes == 'our':
+            made = sides.our_nodes(rate=rate, bridge=bridge, context=context)
         else:
             prepared = nodes == 'prepared'
             made = sides.bare_nodes(rate=rate, bridge=bridge, prepared=prepared, context=context)
@@ -189,7 +185,7 @@ def _plan(quick: bool) -> list[tuple[str, str, list[tuple[Side, Side]]]]:
     if not quick:
         single = Side('our', 'single')
         both += [(single, Side('bare', 'single')), (single, spin)]
-    cpus = [*both, (Side('limited', 'events'), events)]
+    cpus = [*both]
     if not quick:
         cpus += [
             (events, Side('prepared', 'events')),

@@ -1,11 +1,9 @@
-"""All benchmarks in one table: `python test/benchmark/run.py [--quick] [ROW ...]`.
+"""The tables of doc/performance.md: `python test/benchmark/run.py [--quick] [ROW ...]`.
 
-ROW is one or more of odometry, three_processes, lockstep, identity, many_robots, start_up, discovery,
-closed_loops, jacobians, single_calls; without any all are measured (about forty minutes; with --quick,
-to see whether it works, two). Nothing else should run meanwhile. --page writes what was measured into
-doc/performance.md. closed_loops also measures packages that pip
-installs, if they are there (pip install ir-sim roboticstoolbox-python). flood.py and
-inverse_kinematics.py in this folder are benchmarks of their own.
+ROW is one or more of odometry, three_processes, lockstep, many_robots, start_up, discovery; without any
+all are measured (about forty minutes; with --quick, to see whether it works, two). Nothing else should
+run meanwhile. --page writes what was measured into doc/performance.md. The other programs in this folder
+are benchmarks of their own.
 """
 
 from __future__ import annotations
@@ -25,15 +23,11 @@ PAGE = Path(__file__).parents[2] / 'doc' / 'performance.md'
 BEGIN, END = '<!-- measured -->', '<!-- end -->'
 ROWS = (
     'lockstep',
-    'identity',
     'start_up',
     'many_robots',
     'odometry',
     'three_processes',
     'discovery',
-    'closed_loops',
-    'jacobians',
-    'single_calls',
 )
 
 

@@ -16,16 +16,15 @@ from pathlib import Path
 HERE = Path(__file__).parent
 COMMANDS = (
     ('run.py', '--quick'),
-    ('bags.py', '--seconds', '1'),
     ('calibration_cases.py', '--robots', '1', 'UMBmark'),
-    ('crash.py', '1'),
     ('explore_defects.py', '--worlds', '50', 'divides by distance'),
-    ('drift.py', '--seeds', '20', '--rounds', '1', '--limited'),
+    ('drift.py', '--seeds', '20', '--limited'),
     ('inverse_kinematics.py', '--quick'),
     ('limiter.py',),
     ('overshoot.py', '--quick'),
     ('path_tracking.py', '--quick'),
     ('sampled_laws.py', '--robots', '2'),
+    ('soak.py', '--minutes', '0.2'),
     ('uncertainty.py', '--quick'),
 )
 LIMIT = 900.0

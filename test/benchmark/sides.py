@@ -8,7 +8,6 @@ stamped twist for each command; the lean ones send odometry and twist only.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
@@ -130,22 +129,11 @@ def our_controller(**kwargs: Any) -> CountedController:
     return controller
 
 
-LIMITS = {
-    'linear.x.max_acceleration': 1.0,
-    'angular.z.max_acceleration': 2.0,
-    'wheel_lag': 0.1,
-}
-"""Parameters of a robot that takes time to follow its commands."""
-
-
-def our_nodes(
-    *, rate: float = 50.0, bridge: bool = False, limits: Mapping[str, float] | None = None, **kwargs: Any
-) -> list[Any]:
+def our_nodes(*, rate: float = 50.0, bridge: bool = False, **kwargs: Any) -> list[Any]:
     """Make robot and controller, and a bridge between them."""
     overrides = [
         Parameter('publish_rate', value=rate),
         Parameter('command_interface', value='wheels' if bridge else 'twist'),
-        *(Parameter(name, value=value) for name, value in (limits or {}).items()),
     ]
     nodes = [CountedRobot(parameter_overrides=overrides, **kwargs), our_controller(**kwargs)]
     return [*nodes, WheelBridge(**kwargs)] if bridge else nodes

@@ -18,22 +18,18 @@ WIDTH = 150
 
 
 class Goal(NamedTuple):
-    """What the ratio should be; `at_least`: and what it must be at the least, if that is less."""
+    """What the ratio should be."""
 
     ratio: float
     at_most: bool = True
-    at_least: float | None = None
 
     def __str__(self) -> str:
-        if self.at_most:
-            return f'<= {self.ratio:g}'
-        return f'>= {self.ratio:g}' + ('' if self.at_least is None else f' (at least {self.at_least:g})')
+        return f'{"<=" if self.at_most else ">="} {self.ratio:g}'
 
     def judge(self, ratio: float) -> str:
         """Tell whether a ratio reaches it."""
-        if ratio <= self.ratio if self.at_most else ratio >= self.ratio:
-            return 'reached'
-        return 'nearly' if self.at_least is not None and ratio >= self.at_least else 'missed'
+        reached = ratio <= self.ratio if self.at_most else ratio >= self.ratio
+        return 'reached' if reached else 'missed'
 
 
 @dataclass(frozen=True, kw_only=True)

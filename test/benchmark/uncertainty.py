@@ -3,16 +3,12 @@
 For each drive and time: the standard deviations about the reported pose as published, as of first
 order, and of 4,000 Monte Carlo runs of the documented noise model, the mean normalized error squared
 (3 is right), and how many of the runs are in the 95 % region that plot_run draws, and in the ellipse.
-Then the CPU time of a covariance compared with that of first order, interleaved. Half a minute.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
-import statistics
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +18,9 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from support.moments_reference import DRIVES, noisy_runs, reported_path
 
-from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.exact_moments import (
     gaussian,
     propagate_moments,
-    propagated_moments,
 )
 from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance
 from diffdrive_jacobian.simulation.pose_region import (
@@ -38,13 +32,6 @@ from diffdrive_jacobian.simulation.pose_region import (
 
 L, K = 0.16, 1e-5
 SURE = np.zeros((3, 3))
-ARCS = {
-    'straight, 20 ms': ((0.22, 0.0), 0.02),
-    'arc, 20 ms': ((0.22, 0.5), 0.02),
-    'arc, 1 s': ((0.22, 0.5), 1.0),
-    'arc, 300 s': ((0.22, 0.5), 300.0),
-    'straight, 300 s': ((0.22, 0.0), 300.0),
-}
 
 
 def nees(errors, moment):
@@ -87,54 +74,6 @@ def accuracy(count: int) -> Table:
     return table
 
 
-def cost(rounds: int) -> Table:
-    """Return the table of CPU times, both sides in turn.
-
-    A message is the state at its stamp, with both covariances.
-    """
-    table = Table(title='CPU time (us)')
-    for name in (
-        *('arc', 'covariance: exact', 'first order', 'ratio'),
-        *('message: exact', 'first order', 'ratio'),
-    ):
-        table.add_column(name, justify='right')
-    moments = gaussian(1e-4 * np.diag([1.0, 2.0, 3.0]))
-    rows, pose = moments.second_moment.tolist(), (0.0, 0.0, 0.3)
-    model = RobotModel(wheel_separation=L, wheel_travel_variance=K)
-    for name, (twist, held) in ARCS.items():
-        start = Robot(model=model, stamp=0, pose=np.zeros(3), covariance=moments.second_moment)
-        robot, stamps = start.commanded(twist, 0), itertools.count(round(held * 1e9))
-
-        def exact(twist=twist, held=held):
-            propagated_moments(moments, 0.3, twist, held, L, K)
-
-        def of_first_order(twist=twist, held=held):
-            propagate_covariance.formula(rows, pose, twist, held, L, K)
-
-        def exact_message(robot=robot, stamps=stamps):
-            state = robot.at(next(stamps))
-            return state.pose_tuple, state.covariance_tuple, state.twist_covariance_tuple(0.02)
-
-        def first_order_message(robot=robot, stamps=stamps, twist=twist, held=held):
-            state = robot.at(next(stamps))
-            covariance = propagate_covariance.formula(rows, pose, twist, held, L, K)
-            return state.pose_tuple, covariance, state.twist_covariance_tuple(0.02)
-
-        cells = [name]
-        for pair in ((exact, of_first_order), (exact_message, first_order_message)):
-            times: list[list[float]] = [[], []]
-            for _ in range(rounds):
-                for side, found in zip(pair, times, strict=True):
-                    begin = time.process_time()
-                    for _ in range(1000):
-                        side()
-                    found.append((time.process_time() - begin) * 1e3)
-            ratio = statistics.median(one / other for one, other in zip(*times, strict=True))
-            cells += [*(f'{statistics.median(found):.1f}' for found in times), f'{ratio:.2f}']
-        table.add_row(*cells)
-    return table
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--quick', action='store_true', help='fewer runs, to try it')
@@ -143,7 +82,6 @@ def main() -> None:
     if not console.is_terminal:
         console.width = 150
     console.print(accuracy(500 if options.quick else 4000))
-    console.print(cost(3 if options.quick else 15))
 
 
 if __name__ == '__main__':

@@ -144,9 +144,10 @@ def test_two_sigint_of_one_request_end_an_exploration_once(monkeypatch):
 
 
 ENDLESS = """
+import os
 from diffdrive_jacobian.exploration.processes import ChildProcess
 child = ChildProcess()
-print(child._process.pid, flush=True)
+print(child.call(os.getpid), flush=True)
 child.call(exec, 'print("busy", flush=True)\\nwhile True: pass')
 """
 

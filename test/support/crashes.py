@@ -14,7 +14,6 @@ from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from support.raw_bags import read_bag, read_journal
 
-STORAGES = ('mcap', 'sqlite3')
 LATCHED = 5
 """More messages than are latched."""
 ALLOWED_LOSS = 1.0

@@ -1,4 +1,4 @@
-"""Our nodes in a few explored worlds; `promises.py run explored` tries thousands."""
+"""Our nodes in a few explored worlds. doc/promises.md has what thousands of them gave."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Worlds in which our own nodes are explored: a robot, its bridge, its controller and who sends goals.
 
-`promises.py run explored` runs thousands of them, `test_explored_nodes.py` a few.
+`test_explored_nodes.py` runs a few of them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from hypothesis import strategies as st
 from nav_msgs.msg import Goals
-from process_faults.outcome import Outcome
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import make, make_complete
 from support.ros_messages import value_of
@@ -35,7 +34,7 @@ from diffdrive_jacobian.properties import (
     end_of_faults,
 )
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.testing import explore, fault_schedules, goals, poses, times
+from diffdrive_jacobian.testing import fault_schedules, goals, poses, times
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 DISTURBED = 4.0
@@ -258,18 +257,3 @@ def properties():
         StopsAfterLostOdometry(TIMEOUT + timer, node='go_to_goal'),
         StopsAfterLastCommand(TIMEOUT + 1.0 / RATE + timer, commands='joint_command'),
     ]
-
-
-def run(count):
-    """Explore so many worlds of each scenario, for the table of promises."""
-    results = [
-        explore(scenario, properties(), cases=cases, faults=schedules, worlds=count)
-        for scenario, cases, schedules in SCENARIOS.values()
-    ]
-    found = [f'{finding.violation.key}: {finding.trial}' for one in results for finding in one.findings]
-    worlds = sum(one.worlds for one in results)
-    measured = (
-        f'{sum(one.faults for one in results):,} faults, {sum(one.checks for one in results):,} checks, '
-        f'{worlds / sum(one.seconds for one in results):.1f} worlds/s'
-    )
-    return Outcome(worlds, found, measured)

@@ -1,0 +1,85 @@
+"""Nodes as processes: ended by signals, killed, sent hostile messages, as `benchmark/soak.py` does."""
+
+from __future__ import annotations
+
+import math
+import random
+import signal
+from contextlib import suppress
+
+import pytest
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseStamped, Twist
+from nav_msgs.msg import Goals, Odometry
+from rclpy.serialization import serialize_message
+from support.damaged_messages import damaged
+from support.processes import Drive
+from support.ros_messages import goal, goals, odometry
+
+from diffdrive_jacobian.ros.rclpy_internals import RCLError
+
+pytestmark = pytest.mark.process
+
+
+@pytest.fixture
+def driving(world):
+    """Return a robot and a controller that drive to a goal far away, and the publisher of goals."""
+    drive = Drive(world)
+    sender = world.harness.talk(PoseStamped, 'goal_pose')
+    sender.publish(goal(50, 0))
+    world.harness.until(lambda: drive.drives() and drive.commands, 'the robot drives')
+    return drive, sender
+
+
+def test_a_controller_that_a_signal_ends_publishes_a_last_zero(world, driving):
+    drive, _ = driving
+    drive.controller.signal(signal.SIGTERM)
+    assert drive.controller.exit() == 0
+    world.harness.until(lambda: drive.commands[-1] == Twist(), 'the last command is zero')
+    assert 'Traceback' not in drive.controller.stderr
+
+
+def test_a_robot_stops_when_its_controller_is_killed_and_another_one_drives_on(world, driving):
+    drive, sender = driving
+    drive.controller.signal(signal.SIGKILL)
+    drive.controller.exit()
+    world.harness.until(drive.stands, 'the robot stands')
+    assert drive.commands[-1] != Twist()
+    world.start('go_to_goal').until_says('subscribed to')
+    at = drive.odometry[-1].pose.pose.position
+
+    def arrived():
+        # The new controller may discover the sender late.
+        sender.publish(goal(at.x + 0.1, at.y))
+        return any(one.status == GoalStatus.STATUS_SUCCEEDED for one in drive.status)
+
+    world.harness.until(arrived, 'the robot arrives')
+
+
+def test_hostile_messages_neither_end_a_controller_nor_reach_its_commands(world):
+    chance, data = random.Random(1), serialize_message(goals(goal(3, 0), goal(3, 0)))
+    controller = world.start('go_to_goal')
+    commands = world.harness.listen(Twist, 'cmd_vel')
+    hostile = world.harness.talk(Goals, 'goals')
+    seen = world.harness.talk(Odometry, 'odom')
+    for _ in range(200):
+        # Fast DDS publishes none that are empty, or longer than a message of the type can be.
+        with suppress(RCLError):
+            hostile.publish(damaged(chance, data))
+        seen.publish(odometry(0, 0, 0))
+        world.harness.executor.spin_once(timeout_sec=0.002)
+    published = commands[:]
+    commands.clear()
+
+    def drives():
+        hostile.publish(goals(goal(3, 0)))
+        seen.publish(odometry(0, 0, 0))
+        return commands and commands[-1].linear.x > 0.0
+
+    world.harness.until(drives, 'it drives to a valid goal')
+    assert controller.running
+    assert all(math.isfinite(one.linear.x) and math.isfinite(one.angular.z) for one in published)
+    lines = controller.stderr.splitlines()
+    assert len(lines) < 60
+    assert all(map(str.isprintable, lines))
+    assert 'Traceback' not in controller.stderr
