@@ -11,24 +11,17 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.rosbag2.metadata import dump_qos_v9
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
-from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags import mcap
-from diffdrive_jacobian.bags.bag_reader import ROOT, BagError, DamagedBagError, messages, open_bag
-from diffdrive_jacobian.bags.bounded_reader import MAX_MESSAGE
+from diffdrive_jacobian.bags.bag_reader import BagError, DamagedBagError, messages, open_bag
 from diffdrive_jacobian.bags.files import REPLACED, is_journal, scratch_directory, scratch_prefix
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
-from diffdrive_jacobian.bounded_yaml import MAX_SIZE
-from diffdrive_jacobian.text import format_size, printable
 
 if TYPE_CHECKING:
     from rosbags.rosbag2.writer import StorageWriter
@@ -42,10 +35,6 @@ MAX_SQLITE_PATH = 504
 """Length of the longest resolved path that SQLite opens (bytes)."""
 _BAG_SUFFIXES = ('.mcap', '.db3', '.zstd', '.db3-shm', '.db3-wal', '.db3-journal')
 """Endings of the files of a bag besides metadata.yaml."""
-_REMAINDER = 10_000
-"""Length of metadata.yaml without its topics and custom data, at most (characters)."""
-_ESCAPED = 20
-"""Length in YAML of a character, with its share of indentation, at most."""
 _SUM = (1 << 64) - 1
 
 
@@ -119,8 +108,6 @@ class Summary:
     """Time of the last message (ns)."""
     lost: dict[str, int] = field(default_factory=dict)
     """Messages that are known to be missing, by topic."""
-    left_out: tuple[str, ...] = ()
-    """Descriptions of records that are not in the bag because readers would refuse it with them."""
 
 
 def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
@@ -172,8 +159,6 @@ def build_bag(
     compressed: bool = False,
 ) -> Summary:
     """Write records to a new bag, and give it its name after it was read back as readers do.
-
-    Messages and custom data that exceed the limits of the readers are left out.
 
     Args:
         channels: The topics, each with all its profiles.
@@ -245,21 +230,14 @@ def _write(
             for channel in channels.values()
         }
         start = end = None
-        texts: dict[str, str] = {}
-        too_large: Counter[str] = Counter()
         for record in records:
             if isinstance(record, Text):
-                texts[record.key] = record.value
-            elif isinstance(record, Message) and len(record.data) > MAX_MESSAGE:
-                too_large[channels[record.channel].topic] += 1
+                writer.set_custom_data(record.key, record.value)
             elif isinstance(record, Message):
                 writer.write(connections[record.channel], record.stamp, record.data)
                 content.add(channels[record.channel].topic, record.stamp, record.data)
                 start = record.stamp if start is None else min(start, record.stamp)
                 end = record.stamp if end is None else max(end, record.stamp)
-        unwritten = _too_large(texts, writer.connections)
-        for key in texts.keys() - unwritten:
-            writer.set_custom_data(key, texts[key])
         writer.close()
     except BaseException as error:
         with suppress(Exception):
@@ -268,66 +246,17 @@ def _write(
         if isinstance(error, sqlite3.Error):
             raise OSError(errno.EIO, str(error)) from error
         raise
-    left_out = describe_too_large(too_large)
-    left_out += [f'{printable(key)}: metadata.yaml would be too large' for key in unwritten]
     summary = Summary(
         messages=content.counts.total(),
         topics={channel.topic: content.counts[channel.topic] for channel in channels.values()},
         start=start,
         end=end,
-        left_out=tuple(left_out),
     )
     return summary, content
 
 
-def describe_too_large(messages: Mapping[str, int]) -> list[str]:
-    """Return descriptions of messages, counted by topic, that readers would refuse."""
-    return [
-        f'{printable(topic)}: {number} messages larger than {format_size(MAX_MESSAGE)}'
-        for topic, number in sorted(messages.items())
-    ]
-
-
-def _too_large(texts: dict[str, str], connections: Iterable[Connection]) -> list[str]:
-    """Return the keys of the largest custom data, without which readers accept metadata.yaml."""
-    topics = [
-        {
-            'topic_metadata': {
-                'name': one.topic,
-                'type': one.msgtype,
-                'serialization_format': one.ext.serialization_format,
-                'offered_qos_profiles': dump_qos_v9(one.ext.offered_qos_profiles),
-                'type_description_hash': one.digest,
-            },
-            'message_count': 2**63 - 1,
-        }
-        for one in connections
-        if isinstance(one.ext, ConnectionExtRosbag2)
-    ]
-    if _ESCAPED * (len(str(topics)) + sum(map(len, texts.values()))) + _REMAINDER <= MAX_SIZE:
-        return []
-    sizes = {key: _yaml_size({key: value}) for key, value in texts.items()}
-    excess = _REMAINDER + _yaml_size(topics) + sum(sizes.values()) - MAX_SIZE
-    largest = []
-    for key in sorted(sizes, key=sizes.__getitem__, reverse=True):
-        if excess <= 0:
-            break
-        largest.append(key)
-        excess -= sizes[key]
-    return largest
-
-
-def _yaml_size(content: object) -> int:
-    """Return the length of a value at its place in metadata.yaml (characters)."""
-    stream = StringIO()
-    yaml = YAML(typ='safe')
-    yaml.default_flow_style = False
-    yaml.dump({ROOT: {'custom_data': content}}, stream)
-    return len(stream.getvalue())
-
-
 def _contents(path: Path) -> _Content:
-    """Read a whole bag with the limits of all readers, or raise OSError."""
+    """Read a whole bag as all readers do, or raise OSError."""
     content = _Content()
     try:
         with open_bag(path) as reader:

@@ -83,8 +83,6 @@ class Recovery:
     """What the recorder reported as lost, one description for each topic."""
     topics_left_out: bool
     """Whether there are topics whose messages were read but could not be written."""
-    records_left_out: bool
-    """Whether there are records that were read but are too large for a bag."""
     undecodable: tuple[str, ...]
     """Descriptions of messages that were saved but cannot be decoded, and of topics not checked."""
 
@@ -163,11 +161,10 @@ def recover(
             bag=target,
             summary=summary,
             damaged=damaged,
-            lost=lost + summary.left_out,
+            lost=lost,
             unchecked=unchecked,
             lost_before=_lost_before(survey.notes),
             topics_left_out=left_out,
-            records_left_out=bool(summary.left_out),
             undecodable=undecodable,
         )
 

@@ -10,16 +10,9 @@ from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple
 
 from diffdrive_jacobian.bags import mcap
-from diffdrive_jacobian.bags.bounded_reader import (
-    MAX_RECORD,
-    UNPACK_ERRORS,
-    Budget,
-    check_record,
-    unpack,
-)
+from diffdrive_jacobian.bags.corrected_reader import UNPACK_ERRORS, unpack
 from diffdrive_jacobian.bags.files import SQLITE_MAGIC
 from diffdrive_jacobian.bags.journal import CUSTOM_DATA, LIBRARY, Message, Text
-from diffdrive_jacobian.text import format_size
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Note = Callable[[str], None]
@@ -70,11 +63,10 @@ class _McapFile:
         if self._file.read(len(mcap.MAGIC)) != mcap.MAGIC:
             self._note(f'its {size} bytes are not the start of an MCAP file')
             return
-        self._budget = Budget(size)
         good, opcode = len(mcap.MAGIC), 0
         # Where a record is invalid, the position of the next one is unknown.
         with suppress(ValueError):
-            for opcode, payload, end in _walk(self._file, size, self._note):
+            for opcode, payload, end in _walk(self._file, size):
                 if opcode == mcap.CHUNK:
                     yield from self._chunk(payload, end > size)
                 elif end <= size:
@@ -95,8 +87,6 @@ class _McapFile:
         try:
             start, end, size, checksum = (cursor.number(length) for length in (8, 8, 8, 4))
             compression, length = cursor.text(), cursor.number(8)
-            check_record(size, 'it')
-            self._budget.spend(size)
             data = unpack(compression, cursor.left[:length], size)
         except UNPACK_ERRORS as error:
             self._note(f'a chunk of {len(payload)} bytes cannot be unpacked: {error}')
@@ -107,7 +97,7 @@ class _McapFile:
             self._note(f'{what} is damaged: its messages may be altered')
         good = 0
         with suppress(ValueError):
-            for opcode, record, ending in _walk(BytesIO(data), len(data), self._note):
+            for opcode, record, ending in _walk(BytesIO(data), len(data)):
                 if ending <= len(data):
                     yield from self._record(opcode, record, checked=checksum != 0)
                     good = ending
@@ -207,7 +197,7 @@ def read_mcap(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
     return _McapFile(file, note, doubt).read()
 
 
-def _walk(file: BinaryIO, size: int, note: Note) -> Iterator[tuple[int, bytes, int]]:
+def _walk(file: BinaryIO, size: int) -> Iterator[tuple[int, bytes, int]]:
     """Yield opcode, payload and end of each record. The end of one that is cut off is beyond `size`.
 
     A message is yielded when a record or the end follows it. Otherwise its length may be damaged.
@@ -224,13 +214,7 @@ def _walk(file: BinaryIO, size: int, note: Note) -> Iterator[tuple[int, bytes, i
             break
         opcode, length = mcap.HEAD.unpack(head)
         end += mcap.HEAD.size + length
-        if length > MAX_RECORD and end <= size:
-            if opcode != mcap.ATTACHMENT:
-                note(f'a record of {format_size(length)} is not read: it is too large')
-            # A damaged length may be larger than any position.
-            file.seek(min(end, size))
-            continue
-        waiting = [(opcode, file.read(min(length, size, MAX_RECORD)), end)]
+        waiting = [(opcode, file.read(min(length, size - file.tell())), end)]
     yield from waiting
 
 
@@ -247,8 +231,6 @@ _MESSAGE = [int, int, bytes]
 """Types of the columns of a message after its number: topic, time and data."""
 _LOCKS = 1 << 30
 """Place of the page that SQLite uses for locks only."""
-_COPIES = 4
-"""Largest ratio of the size of all rows to that of the file: there may be older copies of pages."""
 
 
 class _Pages:
@@ -263,7 +245,6 @@ class _Pages:
         self.valid = head.startswith(SQLITE_MAGIC) and self.size in [2**n for n in range(9, 17)]
         self.usable = self.size - head[20]
         self.count = self.bytes // self.size if self.valid else 0
-        self._budget = Budget(self.bytes, ratio=_COPIES)
         # Number of pages at the last commit; 0: unknown.
         self.committed = int.from_bytes(head[28:32], 'big') if head[24:28] == head[92:96] else 0
         self._locks = _LOCKS // self.size + 1 if self.valid else 0
@@ -309,8 +290,6 @@ class _Pages:
         if length > most:
             local = least + (length - least) % (self.usable - 4)
             local = local if local <= most else least
-        check_record(length, 'a row')
-        self._budget.spend(length)
         parts = [page[at : at + local]]
         missing = length - len(parts[0])
         following = page[at + local : at + local + 4] if local < length else b''

@@ -14,13 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from diffdrive_jacobian import __version__
-from diffdrive_jacobian.bags.bag_writer import (
-    Summary,
-    build_bag,
-    check_target,
-    describe_too_large,
-)
-from diffdrive_jacobian.bags.bounded_reader import MAX_MESSAGE
+from diffdrive_jacobian.bags.bag_writer import Summary, build_bag, check_target
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import (
     LEFT_OUT,
@@ -186,7 +180,6 @@ class Recording:
         self._channels: dict[int, Channel] = {}
         self._added: Counter[int] = Counter()
         self._dropped: Counter[int] = Counter()
-        self._too_large: Counter[int] = Counter()
         self._missed: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
         self._noted: list[Text] = []
@@ -211,9 +204,8 @@ class Recording:
     def lost(self) -> dict[str, int]:
         """Number of messages known to be lost so far, by topic."""
         lost = Counter(dict(self._missed))
-        for counts in (self._dropped, self._too_large):
-            for topic, number in self._by_topic(counts).items():
-                lost[topic] += number
+        for channel, number in list(self._dropped.items()):
+            lost[self._channels[channel].topic] += number
         return {topic: number for topic, number in sorted(lost.items()) if number}
 
     def add(self, record: Record) -> None:
@@ -224,9 +216,7 @@ class Recording:
             self._channels[record.id] = record
         added = self._thread.add(record)
         if isinstance(record, Message):
-            # Messages that are too large for a bag stay in the journal, which other tools can read.
-            kept = self._too_large if len(record.data) > MAX_MESSAGE else self._added
-            (kept if added else self._dropped)[record.channel] += 1
+            (self._added if added else self._dropped)[record.channel] += 1
 
     def set_missed(self, topic: str, messages: int) -> None:
         """Set the number of messages of a topic that are known to be missed so far."""
@@ -257,8 +247,7 @@ class Recording:
             if self.error is not None:
                 # Messages that were queued, but could not be written, are lost.
                 written = Counter(one.channel for one in self._read() if isinstance(one, Message))
-                self._dropped += self._added - written + self._too_large
-                self._too_large.clear()
+                self._dropped += self._added - written
             summary = build_bag(
                 self._channels.values(),
                 chain(self._read(), self._notes()),
@@ -288,11 +277,9 @@ class Recording:
                 f'{summary.messages}. The journal {journal} is kept',
                 summary,
             )
-        left_out = describe_too_large(self._by_topic(self._too_large))
-        left_out += [*self._unread, *summary.left_out]
-        if left_out:
+        if self._unread:
             raise RecordingError(
-                f'{self.bag} does not contain all that was recorded: {"; ".join(left_out)}. '
+                f'{self.bag} does not contain all that was recorded: {"; ".join(self._unread)}. '
                 f'The journal {journal} is kept',
                 summary,
             )
@@ -321,14 +308,8 @@ class Recording:
                     numbers[found.id] = ids[found.name, found.type_name]
                 elif isinstance(found, Text):
                     yield found
-                elif isinstance(found, Message) and len(found.data) <= MAX_MESSAGE:
+                elif isinstance(found, Message):
                     yield Message(numbers[found.channel], found.stamp, found.data)
-
-    def _by_topic(self, counts: Counter[int]) -> Counter[str]:
-        by_topic: Counter[str] = Counter()
-        for channel, number in list(counts.items()):
-            by_topic[self._channels[channel].topic] += number
-        return by_topic
 
     def _notes(self) -> list[Text]:
         """Return the losses so far as entries of the custom data."""
@@ -345,7 +326,7 @@ class Recording:
 
     def _missing(self) -> str:
         """Return how many messages are neither in the journal nor in the bag; '': none that is known."""
-        number = sum(self.lost.values()) - self._too_large.total()
+        number = sum(self.lost.values())
         return f'. {number} {"message is" if number == 1 else "messages are"} missing' if number else ''
 
     def _describe_losses(self) -> str:

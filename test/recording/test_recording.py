@@ -9,21 +9,18 @@ import shutil
 import stat
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
 from support.raw_bags import channel, read_journal
 
-from diffdrive_jacobian import bounded_yaml
-from diffdrive_jacobian.bags import bag_reader, bounded_reader, journal, recover
+from diffdrive_jacobian.bags import bag_reader, journal, recover
 from diffdrive_jacobian.bags import bag_writer as building
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import (
     LEFT_OUT,
-    PARAMETERS,
     Message,
     Text,
 )
@@ -376,56 +373,6 @@ def test_what_was_missed_or_left_out_is_reported_also_after_a_crash(tmp_path):
     assert not journal_of(bag).exists()
     recovery = recover(tmp_path / 'crashed.journal.mcap')
     assert '/topic_0 was not recorded: it has several types' in recovery.lost_before
-
-
-# --- What readers would refuse
-
-
-def test_custom_data_that_readers_would_refuse_stays_in_the_journal(tmp_path, monkeypatch):
-    for module in (bounded_yaml, building):
-        monkeypatch.setattr(module, 'MAX_SIZE', 60_000, raising=False)
-    recording = Recording(tmp_path / 'run', 'sqlite3')
-    large = {
-        f'{PARAMETERS}/robot_{index}': json.dumps({'text': "it's " * 2_000 * (index + 1)})
-        for index in range(4)
-    }
-    add_all(recording, CHANNEL, *messages(3), *(Text(*one) for one in large.items()))
-    error = failed(recording, r'robot_3.*too large.*run\.journal\.mcap is kept')
-    assert error.summary.messages == 3
-    kept = custom_data(tmp_path / 'run')
-    assert len(content(tmp_path / 'run')) == 3
-    assert kept['storage'] == 'sqlite3'
-    assert f'{PARAMETERS}/robot_0' in kept
-    assert len(large) > sum(key in kept for key in large)
-    recovery = recover(journal_of(tmp_path / 'run'), tmp_path / 'again')
-    assert recovery.records_left_out
-    assert any('robot_3: metadata.yaml would be too large' in one for one in recovery.lost)
-
-
-def test_a_message_that_readers_would_refuse_stays_in_the_journal(tmp_path, monkeypatch):
-    monkeypatch.setattr(bounded_reader, 'MAX_RECORD', 500_000)
-    for module in (building, recordings):
-        monkeypatch.setattr(module, 'MAX_MESSAGE', 300_000)
-    monkeypatch.setattr(journal, 'BLOCK', 100_000)
-    sizes = (40, 400_000, 600_000, 40)
-    records = [one for size in sizes for one in messages(1, size=size)]
-    error = failed(recorded(tmp_path / 'run', *records), '/cmd_vel: 2 messages larger than 300')
-    summary = error.summary
-    assert (summary.messages, summary.lost) == (2, {'/cmd_vel': 2})
-    assert losses(tmp_path / 'run') == {'/cmd_vel': 2}
-    assert len(content(tmp_path / 'run')) == 2
-    recovery = recover(journal_of(tmp_path / 'run'), tmp_path / 'again')
-    assert recovery.records_left_out
-    lost = ' '.join(recovery.lost)
-    assert '/cmd_vel: 1 messages larger than 300.0 kB' in lost
-    assert 'it unpacks to 600.0 kB; at most 500.0 kB are read' in lost
-
-
-def test_more_than_the_readers_unpack_at_once_can_be_recorded_at_one_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(bounded_reader, 'MAX_OVERLAP', 4_000_000)
-    records = [replace(one, stamp=7) for one in messages(12, size=1_000_000)]
-    assert recorded(tmp_path / 'run', *records).finish().messages == 12
-    assert content(tmp_path / 'run') == [one.data for one in records]
 
 
 # --- File systems that lack something
