@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,6 @@ from diffdrive_jacobian.safe_yaml import YAML_ERRORS, load_yaml
 from diffdrive_jacobian.text import printable
 
 _PARSE_ERRORS = (TypesysError, LookupError, ValueError, AssertionError, RecursionError)
-READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}
 BLOCK = 1 << 20
 """Size of the parts in which a file is decompressed (bytes)."""
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
@@ -244,9 +243,10 @@ class DamagedBag:
         faults: Counter[str] = Counter()
         start, end = 2**63, -1
         with open(source, 'rb') as file:
-            reader = READERS[file_kind(source)]
+            reader = partial(read_mcap, file)
+            if file_kind(source) == 'sqlite3':
+                reader = partial(read_sqlite, source)
             for one in reader(
-                file,
                 lambda what: self.lost.append(f'{name}: {what}'),
                 lambda what: self.unchecked.append(f'{name}: {what}'),
             ):
@@ -310,20 +310,18 @@ class DamagedBag:
 
 
 def _unpacked(file: Path, scratch: Path) -> Path:
-    """Return the file, or a copy that is decompressed or includes the write-ahead log of SQLite."""
+    """Return the file, or a copy: of one that is compressed, or of SQLite, which may change it."""
     copy = Path(tempfile.mkdtemp(dir=scratch)) / file.name.removesuffix(ZSTD)
-    log = file.with_name(f'{file.name}-wal')
     if file.suffix == ZSTD:
         # If it is cut off, what was decompressed is read; the reader reports the rest.
         with suppress(*UNPACK_ERRORS), zstd.open(file, 'rb') as packed, open(copy, 'wb') as out:
             while block := packed.read(BLOCK):
                 out.write(block)
         return copy
-    if log.is_file() and log.stat().st_size:
-        shutil.copyfile(file, copy)
-        shutil.copyfile(log, copy.with_name(log.name))
-        with suppress(sqlite3.Error), closing(sqlite3.connect(copy)) as database:
-            database.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+    if file_kind(file) == 'sqlite3':
+        for ending in ('', '-wal', '-journal'):
+            with suppress(FileNotFoundError):
+                shutil.copyfile(f'{file}{ending}', f'{copy}{ending}')
         return copy
     return file
 
