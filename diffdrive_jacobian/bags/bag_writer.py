@@ -1,10 +1,9 @@
-"""Writing of bags from the records of a journal: rosbag2 version 9, MCAP or SQLite."""
+"""Writing of bags from the records of a journal: rosbag2 version 9, MCAP."""
 
 from __future__ import annotations
 
 import errno
 import os
-import sqlite3
 import struct
 import zlib
 from collections import Counter
@@ -16,23 +15,19 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2.storage_mcap import McapWriter
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
 from diffdrive_jacobian.bags import mcap
 from diffdrive_jacobian.bags.bag_reader import BagError, DamagedBagError, messages, open_bag
-from diffdrive_jacobian.bags.files import REPLACED, is_journal, scratch_directory, scratch_prefix
+from diffdrive_jacobian.bags.files import REPLACED, is_journal, scratch_directory
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
 
 if TYPE_CHECKING:
     from rosbags.rosbag2.writer import StorageWriter
 
-STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 _CHUNK_CHECKSUM = 9 + 3 * 8
 """Place of the checksum in the record of a chunk, after opcode, length, times and size."""
 _DATA_END = 9 + 4
 """Size of the record that ends the data section and has its checksum."""
-MAX_SQLITE_PATH = 504
-"""Length of the longest resolved path that SQLite opens (bytes)."""
 _BAG_SUFFIXES = ('.mcap', '.db3', '.zstd', '.db3-shm', '.db3-wal', '.db3-journal')
 """Endings of the files of a bag besides metadata.yaml."""
 _SUM = (1 << 64) - 1
@@ -65,33 +60,11 @@ class _CheckedMcapWriter(McapWriter):
         file.write(struct.pack('<I', checksum))
 
 
-class _SqliteWriter(Sqlite3Writer):
-    """rosbags' writer, which opens its file by the path and not by a URI.
-
-    In the URI `file:PATH` of rosbags `#`, `?` and `%` have a meaning: it would write another file.
-    """
-
-    def __init__(self, path: Path, compression: CompressionMode) -> None:
-        self.path = path.absolute() / f'{path.name}.db3'
-        self.conn = sqlite3.connect(self.path)
-        try:
-            # A bag gets its name after its files were synced. Until then it need not survive
-            # a power cut.
-            self.conn.execute('PRAGMA synchronous = OFF')
-            self.conn.execute('PRAGMA journal_mode = MEMORY')
-            self.conn.executescript(self.SQLITE_SCHEMA)
-        except BaseException:
-            self.conn.close()  # Nobody else can: there is no writer yet.
-            raise
-        self.cursor = self.conn.cursor()
-
-
 class BagWriter(Writer):
-    """rosbags' writer with these formats."""
+    """rosbags' writer with these checksums."""
 
     STORAGE_PLUGINS: Mapping[StoragePlugin, type[StorageWriter]] = {
-        StoragePlugin.MCAP: _CheckedMcapWriter,
-        StoragePlugin.SQLITE3: _SqliteWriter,
+        StoragePlugin.MCAP: _CheckedMcapWriter
     }
 
 
@@ -110,13 +83,13 @@ class Summary:
     """Messages that are known to be missing, by topic."""
 
 
-def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
+def check_target(target: Path, *, replace: bool = False) -> None:
     """Check that a bag can have this path, before anything is recorded for it.
 
     Raises:
         FileExistsError: It exists, possibly as a broken symbolic link, and is not to be replaced or
             is not a bag.
-        OSError: Its name is not UTF-8, as metadata.yaml must be, or its path is too long for SQLite.
+        OSError: Its name is not UTF-8, as metadata.yaml must be.
     """
     if os.path.lexists(target):
         if not replace:
@@ -127,15 +100,6 @@ def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
         target.name.encode()
     except UnicodeEncodeError:
         raise OSError(errno.EILSEQ, f'the name of a bag must be UTF-8, got {target.name!a}') from None
-    if storage == 'sqlite3':
-        scratch = target.parent.resolve() / (scratch_prefix(target) + 8 * 'x')
-        length = len(os.fsencode(scratch / target.name / f'{target.name}.db3'))
-        if length > MAX_SQLITE_PATH:
-            raise OSError(
-                errno.ENAMETOOLONG,
-                f'the path is too long for SQLite: at most {MAX_SQLITE_PATH} bytes, got {length} with '
-                'the directory in which the bag is written',
-            )
 
 
 def _is_nothing_but_a_bag(path: Path) -> bool:
@@ -153,7 +117,6 @@ def build_bag(
     channels: Iterable[Channel],
     records: Iterable[Record],
     target: Path,
-    storage: str,
     *,
     replace: bool = False,
     compressed: bool = False,
@@ -164,26 +127,25 @@ def build_bag(
         channels: The topics, each with all its profiles.
         records: The messages and the custom data. Channels among them are not used.
         target: The bag's directory.
-        storage: `mcap` or `sqlite3`.
         replace: Whether it may replace another bag, which stays until the new one is complete.
-        compressed: Whether the chunks of an MCAP file are compressed by zstd.
+        compressed: Whether the chunks are compressed by zstd.
 
     Raises:
         OSError: As of `check_target`; or it cannot be written, or is not read back as it was written.
             It is removed then.
     """
-    check_target(target, storage, replace=replace)
+    check_target(target, replace=replace)
     with scratch_directory(target) as scratch:
         # The directory has the final name, after which rosbags names the files.
         bag = scratch / target.name
-        summary, written = _write(records, {one.id: one for one in channels}, bag, storage, compressed)
+        summary, written = _write(records, {one.id: one for one in channels}, bag, compressed)
         if _contents(bag) != written:
             raise OSError(errno.EIO, 'what was read back from it is not what was written to it')
         for path in bag.iterdir():
             _sync(path)
         _sync(bag)
         # Renaming would replace an empty directory that was created meanwhile.
-        check_target(target, storage, replace=replace)
+        check_target(target, replace=replace)
         if replace and target.exists():
             old = scratch / REPLACED
             os.rename(target, old)
@@ -211,9 +173,9 @@ class _Content:
 
 
 def _write(
-    records: Iterable[Record], channels: dict[int, Channel], path: Path, storage: str, compressed: bool
+    records: Iterable[Record], channels: dict[int, Channel], path: Path, compressed: bool
 ) -> tuple[Summary, _Content]:
-    writer = BagWriter(path, version=9, storage_plugin=STORAGES[storage])
+    writer = BagWriter(path, version=9, storage_plugin=StoragePlugin.MCAP)
     if compressed:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     content = _Content()
@@ -239,12 +201,10 @@ def _write(
                 start = record.stamp if start is None else min(start, record.stamp)
                 end = record.stamp if end is None else max(end, record.stamp)
         writer.close()
-    except BaseException as error:
+    except BaseException:
         with suppress(Exception):
             # Closing would fail for the same reason as writing.
             writer.abort()
-        if isinstance(error, sqlite3.Error):
-            raise OSError(errno.EIO, str(error)) from error
         raise
     summary = Summary(
         messages=content.counts.total(),

@@ -19,7 +19,6 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from diffdrive_jacobian.bags.bag_reader import MetadataError, parse_parameters
-from diffdrive_jacobian.bags.bag_writer import STORAGES
 from diffdrive_jacobian.bags.corrected_reader import UNPACK_ERRORS, zstd
 from diffdrive_jacobian.bags.files import (
     ZSTD,
@@ -117,8 +116,6 @@ class DamagedBag:
         """
         self.path = path
         files = bag_files(path)
-        self.storage = file_kind(files[0])
-        """Storage of a new bag that is like the old one, `mcap` or `sqlite3`."""
         self.lost: list[str] = []
         """Descriptions of what could not be read. This and the next two are complete after all records
         were read."""
@@ -257,8 +254,6 @@ class DamagedBag:
                     for text in _custom_data(metadata):
                         yield from self._text(text)
                 elif isinstance(one, Text):
-                    if one.key == 'storage' and one.value in STORAGES:
-                        self.storage = one.value
                     yield from self._text(one)
                 elif isinstance(one, Topic):
                     known = channels.get((one.name, one.type_name))

@@ -90,7 +90,6 @@ class Recovery:
 def recover(
     what: Path,
     output: Path | None = None,
-    storage: str | None = None,
     *,
     replace: bool = False,
     interrupted: Callable[[], bool] = lambda: False,
@@ -100,7 +99,6 @@ def recover(
     Args:
         what: A bag's directory, one of its files, a journal, or the bag that a journal belongs to.
         output: The new bag's directory. By default it is beside the old one.
-        storage: `mcap` or `sqlite3`. By default that of the old bag.
         replace: Whether the new bag may replace another one than the old one.
         interrupted: Is called for each record; once it returns True nothing is left of the new bag.
 
@@ -154,7 +152,6 @@ def recover(
             survey.channels.values(),
             islice(records(), surveyed),
             target,
-            storage or old.storage,
             replace=replace,
         )
         return Recovery(

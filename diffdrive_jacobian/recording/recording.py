@@ -149,7 +149,6 @@ class Recording:
     def __init__(
         self,
         bag: Path,
-        storage: str,
         *,
         lossless: bool = False,
         replace: bool = False,
@@ -158,7 +157,6 @@ class Recording:
 
         Args:
             bag: Directory of the bag. Its journal must not exist.
-            storage: `mcap` or `sqlite3`.
             lossless: Whether `add` waits for a disk that is too slow. Otherwise messages are dropped.
             replace: Whether the bag may replace another one, which stays until then.
 
@@ -166,7 +164,7 @@ class Recording:
             FileExistsError: The journal exists, or the bag, and it is not to be replaced or is no bag.
             OSError: They cannot be written there.
         """
-        check_target(bag, storage, replace=replace)
+        check_target(bag, replace=replace)
         journal = journal_of(bag)
         if journal.exists():
             raise FileExistsError(
@@ -174,7 +172,6 @@ class Recording:
             )
         self.bag = bag
         self.journal = JournalWriter(journal)
-        self._storage = storage
         self._replace = replace
         self.started = time.monotonic()
         self._channels: dict[int, Channel] = {}
@@ -186,7 +183,6 @@ class Recording:
         self._unread: list[str] = []
         self._open = True
         self.journal.add(Text('recorder', f'diffdrive_jacobian {__version__}'))
-        self.journal.add(Text('storage', storage))
         try:
             self.journal.flush()
         except OSError:
@@ -252,7 +248,6 @@ class Recording:
                 self._channels.values(),
                 chain(self._read(), self._notes()),
                 self.bag,
-                self._storage,
                 replace=self._replace,
             )
         # Whatever rosbags raises: the user must know that the journal exists.
@@ -358,7 +353,7 @@ class Recording:
 
 
 def open_recording(
-    prefix: str, output: str | None, storage: str, *, lossless: bool = False, replace: bool = False
+    prefix: str, output: str | None, *, lossless: bool = False, replace: bool = False
 ) -> Recording:
     """Start a recording to a path of the user, or in the current directory as `PREFIX_DATE-TIME`.
 
@@ -367,11 +362,11 @@ def open_recording(
     """
     try:
         if output is not None:
-            return Recording(Path(output), storage, lossless=lossless, replace=replace)
+            return Recording(Path(output), lossless=lossless, replace=replace)
         for name in names_by_time(prefix):
             # Other processes may take the same name.
             with suppress(FileExistsError):
-                return Recording(Path(name), storage, lossless=lossless)
+                return Recording(Path(name), lossless=lossless)
     except OSError as error:
         where = output or 'this directory'
         raise OSError(f'cannot record to {where}: {(error.strerror or str(error)).lower()}') from error

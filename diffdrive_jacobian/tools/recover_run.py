@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,7 +37,6 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             recovery = recover(
                 options.bag,
                 options.output,
-                options.storage,
                 replace=options.force,
                 interrupted=lambda: signals.count > 0,
             )
@@ -51,7 +49,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         return UNCHECKED if isinstance(error, UncheckedError) else FAILED
     except (NotABagError, FileExistsError) as error:
         return _output.complain(PROGRAM, error)
-    except (OSError, sqlite3.Error) as error:
+    except OSError as error:
         wrong = isinstance(error, PermissionError | FileNotFoundError | NotADirectoryError)
         code = USER_ERROR if wrong else FAILED
         return _output.complain(PROGRAM, f'no bag was written: {error}', code)
@@ -102,5 +100,5 @@ def _parser() -> _cli.Parser:
         kind=Path,
     )
     parser.add_force('NEW, which must not be BAG')
-    parser.add_storage()
+    parser.refuse_storage()
     return parser

@@ -334,7 +334,7 @@ def test_bytes_of_messages(tmp_path):
             known = channels.setdefault(topic, channel(len(channels), topic, name, (LATCHED,)))
             cut_at = chance.choice((len(data), 12))
             records.append(Message(known.id, round(at * SECOND), bytes(data[:cut_at])))
-    build_bag(channels.values(), records, tmp_path / 'bag', 'mcap')
+    build_bag(channels.values(), records, tmp_path / 'bag')
     run, _ = check_values(tmp_path / 'bag', tmp_path / 'new')
     assert sum(run.skipped.values()) > 0
 

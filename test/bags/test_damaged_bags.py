@@ -243,7 +243,7 @@ def test_parameters_that_are_none_are_left_out_by_recover_run(tmp_path):
     for number, text in enumerate(('', '[1, 2]', '3', '[' * 10_000, '{"kp": ' + '9' * 5000 + '}')):
         bag = tmp_path / f'{number}'
         records = [Text(f'{PARAMETERS}/robot', text), other, *poses]
-        build_bag([channel(0, '/odom', ODOMETRY.name)], records, bag, 'mcap')
+        build_bag([channel(0, '/odom', ODOMETRY.name)], records, bag)
         with pytest.raises(BagError, match=r'parameters of /robot.*recover_run'):
             read_run(bag)
         recovery = recover(bag)

@@ -1,6 +1,6 @@
 """How much a killed record_run loses: `python test/benchmark/crash.py [RUNS]`.
 
-Each of RUNS (20) runs with each storage is killed by SIGKILL at a random instant of its first three
+Each of RUNS (20) runs is killed by SIGKILL at a random instant of its first three
 seconds and recovered. The loss is the time between the last message that a subscriber beside the
 recorder had heard at the kill and the last one in the recovered bag (50 Hz odometry); the messages
 of that bag are compared byte by byte with those heard, without a gap.
@@ -21,7 +21,7 @@ from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from support.crashes import ALLOWED_LOSS, STORAGES, Control, crash
+from support.crashes import ALLOWED_LOSS, Control, crash
 from support.processes import open_world
 
 from diffdrive_jacobian.signals import Signals
@@ -33,7 +33,7 @@ LONGEST = 3.0
 """Of a run (s)."""
 
 
-def measure(runs: int, storage: str, folder: Path) -> list[tuple[float, float, int]]:
+def measure(runs: int, folder: Path) -> list[tuple[float, float, int]]:
     """Give for each run how long it was recorded (s), what was lost (s), and the messages saved."""
     chance = random.Random()
     found = []
@@ -45,36 +45,32 @@ def measure(runs: int, storage: str, folder: Path) -> list[tuple[float, float, i
         for number in range(runs):
             if number % A_WORLD == 0:
                 world.close()
-                place = folder / f'{storage}_{number}'
+                place = folder / f'world_{number}'
                 place.mkdir()
                 control = Control(world.enter_context(open_world(place)))
             seconds = chance.uniform(0.0, LONGEST)
-            loss, saved = crash(control, folder / f'{storage}_run_{number}', storage, seconds, run)
+            loss, saved = crash(control, folder / f'run_{number}', seconds, run)
             found.append((seconds, loss, saved))
     return found
 
 
 def main() -> None:
     runs = int(sys.argv[1]) if len(sys.argv) > 1 else 20
-    table = Table('storage', 'runs', 'lost: median (s)', 'most (s)', 'allowed (s)', 'saved messages')
-    details = []
-    with tempfile.TemporaryDirectory() as folder:
-        for storage in STORAGES:
-            with redirect_stdout(StringIO()):
-                found = measure(runs, storage, Path(folder))
-            losses = [loss for _, loss, _ in found]
-            saved = [count for _, _, count in found]
-            table.add_row(
-                storage,
-                str(len(found)),
-                f'{statistics.median(losses):.3f}',
-                f'{max(losses):.3f}',
-                f'{ALLOWED_LOSS:g}',
-                f'{min(saved)}-{max(saved)}',
-            )
-            details.append(f'{storage}: ' + ' '.join(f'{loss:.2f}' for loss in losses))
+    table = Table('runs', 'lost: median (s)', 'most (s)', 'allowed (s)', 'saved messages')
+    with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
+        found = measure(runs, Path(folder))
+    losses = [loss for _, loss, _ in found]
+    saved = [count for _, _, count in found]
+    table.add_row(
+        str(len(found)),
+        f'{statistics.median(losses):.3f}',
+        f'{max(losses):.3f}',
+        f'{ALLOWED_LOSS:g}',
+        f'{min(saved)}-{max(saved)}',
+    )
+    details = ' '.join(f'{loss:.2f}' for loss in losses)
     console = Console(width=110)
-    console.print(table, *details, sep='\n', highlight=False)
+    console.print(table, details, sep='\n', highlight=False)
 
 
 if __name__ == '__main__':

@@ -71,9 +71,8 @@ class Recording:
         # Another topic in each world: messages for the recorder before may still be under way.
         self.topic = f'/odom{next(_numbers)}'
         self.publisher = world.harness.peer.create_publisher(Odometry, self.topic, 2000)
-        storage = chance.choice(('mcap', 'sqlite3'))
         with mock.patch.object(processes, 'PROGRAM', prefix + processes.PROGRAM):
-            self.child = world.start('record_run', self.topic, '-o', str(self.bag), '-s', storage)
+            self.child = world.start('record_run', self.topic, '-o', str(self.bag))
         self.sent = []
         self.harness.until(
             lambda: self.publisher.get_subscription_count() or not self.child.running, 'it records'

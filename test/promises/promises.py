@@ -72,13 +72,11 @@ def tests(*files):
 
 
 def crashes(count):
-    """Kill so many recordings with each storage."""
-    from crash import ALLOWED_LOSS, STORAGES, measure
+    """Kill so many recordings."""
+    from crash import ALLOWED_LOSS, measure
 
-    losses = []
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
-        for storage in STORAGES:
-            losses += [loss for _, loss, _ in measure(count, storage, Path(folder))]
+        losses = [loss for _, loss, _ in measure(count, Path(folder))]
     violations = [f'{loss:.2f} s are lost' for loss in losses if loss > ALLOWED_LOSS]
     return Outcome(len(losses), violations, f'lost: {spread(losses, "s")}')
 
