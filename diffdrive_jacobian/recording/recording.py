@@ -238,7 +238,11 @@ class Recording:
         self._thread.close()
         journal = self.journal.path
         if not self.journal.in_place():
-            self._raise_gone()
+            self.journal.close()
+            raise RecordingError(
+                f'{journal} was removed, renamed or replaced while it was being recorded: no bag is '
+                'written. If the file still exists elsewhere, recover_run writes the bag from it'
+            )
         try:
             if self.error is not None:
                 # Messages that were queued, but could not be written, are lost.
@@ -337,19 +341,6 @@ class Recording:
             for topic, why in sorted(self._left_out.items())
         ]
         return '; '.join(parts)
-
-    def _raise_gone(self) -> None:
-        journal = self.journal.path
-        what = f'{journal} was removed, renamed or replaced while it was being recorded'
-        try:
-            found = self.journal.rescue()
-        except OSError as error:
-            raise RecordingError(f'{what}, and its content cannot be saved: {error}') from error
-        finally:
-            self.journal.close()
-        raise RecordingError(
-            f'{what}. The recorded messages are in {found}: recover_run {found} writes the bag from it'
-        )
 
 
 def open_recording(

@@ -129,19 +129,15 @@ def slow_disk(world, folder, chance):
     return made, made.end()
 
 
-def removed_folder(world, folder, chance):
+def renamed_folder(world, folder, chance):
     place = folder / 'place'
     place.mkdir()
     made = Recording(world, place, '', chance)
     made.send(chance.uniform(0.4, SECONDS))
-    if chance.random() < 0.5:
-        shutil.rmtree(place)
-    else:
-        place.rename(folder / 'renamed')
+    place.rename(folder / 'renamed')
     made.send(SECONDS)
     code = made.end()
-    found = list(folder.rglob('run*.journal.mcap'))
-    made.bag = found[0] if found else made.bag
+    made.bag = folder / 'renamed' / 'run.journal.mcap'
     return made, code
 
 
@@ -177,7 +173,7 @@ FAULTS = {
     'disk that fails': failing('EIO'),
     'exceeded quota': failing('EDQUOT'),
     'slow disk': slow_disk,
-    'folder removed or renamed': removed_folder,
+    'folder renamed': renamed_folder,
     'limit of the file size': limited(resource.RLIMIT_FSIZE, short_files),
     'few descriptors': limited(resource.RLIMIT_NOFILE, few_descriptors),
     'little memory': limited(resource.RLIMIT_AS, little_memory),
