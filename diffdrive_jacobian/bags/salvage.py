@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from diffdrive_jacobian.bags import mcap
 from diffdrive_jacobian.bags.corrected_reader import UNPACK_ERRORS, unpack
@@ -240,36 +240,43 @@ def read_sqlite(path: Path, note: Note, doubt: Note) -> Iterator[Found]:
     """
     doubt('SQLite has no checksums, so altered messages cannot be noticed')
     last = read = 0
-    try:
-        with closing(sqlite3.connect(path)) as database:
-            database.text_factory = lambda data: data.decode(errors='replace')
-            # SQLite refuses all of a file that is cut off, or fills its last page up with zeros.
-            database.execute('PRAGMA writable_schema = ON')
-            (page,) = database.execute('PRAGMA page_size').fetchone()
+    with closing(sqlite3.connect(path)) as database:
+
+        def rows(query: str) -> Iterator[Any]:
+            """Yield the rows up to the one that SQLite refuses."""
+            try:
+                yield from database.execute(query)
+            # The names of damaged columns may be no text.
+            except (sqlite3.Error, UnicodeDecodeError) as error:
+                refusal = f'SQLite refuses the rest: {error}'
+                note(f'{refusal}; it may be had with `sqlite3 {path.name} .recover`')
+
+        database.text_factory = lambda data: data.decode(errors='replace')
+        # SQLite refuses all of a file that is cut off, or fills its last page up with zeros.
+        for _ in rows('PRAGMA writable_schema = ON'):
+            pass
+        for (page,) in rows('PRAGMA page_size'):
             os.truncate(path, path.stat().st_size // page * page)
-            tables = {name for (name,) in database.execute('SELECT name FROM sqlite_master')}
-            if 'metadata' in tables:
-                for (text,) in database.execute('SELECT metadata FROM metadata'):
-                    yield str(text)
-            definitions: dict[str, str] = {}
-            if 'message_definitions' in tables:
-                columns = 'topic_type, encoded_message_definition'
-                definitions.update(database.execute(f'SELECT {columns} FROM message_definitions'))
-            for number, *texts in database.execute('SELECT * FROM topics'):
-                # Older versions have no profiles and no hash.
-                name, kind, encoding, qos, type_hash = [*map(str, texts), *5 * ['']][:5]
-                definition = str(definitions.get(kind, ''))
-                yield Topic(number, name, kind, encoding, qos, type_hash, definition)
-            rows = database.execute('SELECT rowid, topic_id, timestamp, data FROM messages')
-            for number, *message in rows:
-                if [type(value) for value in (number, *message)] == _MESSAGE:
-                    yield Message(*message)
-                    read += 1
-                last = max(last, number)
-            for (problem,) in database.execute('PRAGMA integrity_check(1)'):
-                if problem != 'ok':
-                    note(f'SQLite finds it damaged: {" ".join(problem.split())}')
-    except sqlite3.Error as error:
-        note(f'SQLite refuses the rest: {error}; it may be had with `sqlite3 {path.name} .recover`')
+        tables = {name for (name,) in rows('SELECT name FROM sqlite_master')}
+        if 'metadata' in tables:
+            for (text,) in rows('SELECT metadata FROM metadata'):
+                yield str(text)
+        definitions: dict[str, str] = {}
+        if 'message_definitions' in tables:
+            columns = 'topic_type, encoded_message_definition'
+            definitions.update(rows(f'SELECT {columns} FROM message_definitions'))
+        for number, *texts in rows('SELECT * FROM topics'):
+            # Older versions have no profiles and no hash.
+            name, kind, encoding, qos, type_hash = [*map(str, texts), *5 * ['']][:5]
+            definition = str(definitions.get(kind, ''))
+            yield Topic(number, name, kind, encoding, qos, type_hash, definition)
+        for number, *message in rows('SELECT rowid, topic_id, timestamp, data FROM messages'):
+            if [type(value) for value in (number, *message)] == _MESSAGE:
+                yield Message(*message)
+                read += 1
+            last = max(last, number)
+        for (problem,) in rows('PRAGMA integrity_check(1)'):
+            if problem != 'ok':
+                note(f'SQLite finds it damaged: {" ".join(problem.split())}')
     if last > read:
         note(f'its messages have the numbers 1 to {last}, {read} were found')
