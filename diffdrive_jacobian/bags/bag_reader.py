@@ -12,12 +12,12 @@ from typing import Any
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.metadata import parse_qos
 from ruamel.yaml.error import YAMLError
 
-from diffdrive_jacobian.bags.bounded_reader import BoundedReader, parse_bounded_qos
+from diffdrive_jacobian.bags.corrected_reader import CorrectedReader
 from diffdrive_jacobian.bags.files import NotARegularFileError, check_regular, is_recoverable, journal_of
 from diffdrive_jacobian.bags.journal import PARAMETERS
-from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.numerics.fields import (
     integer,
@@ -29,6 +29,7 @@ from diffdrive_jacobian.numerics.fields import (
     short,
     text,
 )
+from diffdrive_jacobian.safe_yaml import YAML_ERRORS, load_yaml
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 
 LATEST_VERSION = 9
@@ -50,13 +51,11 @@ def check_metadata(path: Path) -> None:
     Raises:
         NotARegularFileError: It, or a data file that it lists, is a directory, a pipe, ...
         OSError: It cannot be read.
-        MetadataError: It is not YAML of moderate size, or one of its values is invalid.
+        MetadataError: It is not YAML, or one of its values is invalid.
     """
     check_regular(path)
     try:
         found = load_yaml(path)
-    except TooLargeError as error:
-        raise MetadataError(f'metadata.yaml is too large: {error}') from error
     except YAML_ERRORS as error:
         raise MetadataError(f'metadata.yaml is not valid YAML: {printable(error, 120)}') from error
     with _reported():
@@ -123,7 +122,7 @@ def _check_topic(topic: dict[str, Any], where: str) -> None:
     text(f'{where}.type_description_hash', described.get('type_description_hash', ''))
     profiles = described.get('offered_qos_profiles', [])
     try:
-        parse_bounded_qos(profiles)
+        parse_qos(profiles)
     except (*INVALID, RecursionError) as error:
         raise ValueError(
             f'{where}.offered_qos_profiles must be a list of QoS profiles, got {short(profiles, repr)}'
@@ -258,10 +257,8 @@ def open_bag(path: Path) -> Iterator[Reader]:
     try:
         if path.is_dir():
             check_metadata(path / 'metadata.yaml')
-        reader = BoundedReader(path)
+        reader = CorrectedReader(path)
         reader.open()
-    except TooLargeError as error:
-        raise BagError(f'{name} cannot be read: {error}') from error
     except (MetadataError, NotARegularFileError) as error:
         raise DamagedBagError(path, str(error)) from error
     except Exception as error:  # whatever the parsers of a damaged file raise
@@ -334,8 +331,6 @@ def messages(
                 yield connection, received, bytes(data)
             elif invalid is not None:
                 invalid[connection.topic] += 1
-    except TooLargeError as error:
-        raise BagError(f'{reader.path} cannot be read: {error}') from error
     except Exception as error:  # as in open_bag
         raise DamagedBagError(Path(str(reader.path)), printable(repr(error), 200)) from error
 

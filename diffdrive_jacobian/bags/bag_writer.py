@@ -1,51 +1,35 @@
-"""Writing of bags from the records of a journal: rosbag2 version 9, MCAP or SQLite."""
+"""Writing of bags from the records of a journal: rosbag2 version 9, MCAP."""
 
 from __future__ import annotations
 
 import errno
 import os
-import sqlite3
 import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.rosbag2.metadata import dump_qos_v9
 from rosbags.rosbag2.storage_mcap import McapWriter
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
-from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags import mcap
-from diffdrive_jacobian.bags.bag_reader import ROOT, BagError, DamagedBagError, messages, open_bag
-from diffdrive_jacobian.bags.bounded_reader import MAX_MESSAGE
-from diffdrive_jacobian.bags.files import REPLACED, is_journal, scratch_directory, scratch_prefix
+from diffdrive_jacobian.bags.bag_reader import BagError, DamagedBagError, messages, open_bag
+from diffdrive_jacobian.bags.files import REPLACED, is_journal, scratch_directory
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
-from diffdrive_jacobian.bounded_yaml import MAX_SIZE
-from diffdrive_jacobian.text import format_size, printable
 
 if TYPE_CHECKING:
     from rosbags.rosbag2.writer import StorageWriter
 
-STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 _CHUNK_CHECKSUM = 9 + 3 * 8
 """Place of the checksum in the record of a chunk, after opcode, length, times and size."""
 _DATA_END = 9 + 4
 """Size of the record that ends the data section and has its checksum."""
-MAX_SQLITE_PATH = 504
-"""Length of the longest resolved path that SQLite opens (bytes)."""
 _BAG_SUFFIXES = ('.mcap', '.db3', '.zstd', '.db3-shm', '.db3-wal', '.db3-journal')
 """Endings of the files of a bag besides metadata.yaml."""
-_REMAINDER = 10_000
-"""Length of metadata.yaml without its topics and custom data, at most (characters)."""
-_ESCAPED = 20
-"""Length in YAML of a character, with its share of indentation, at most."""
 _SUM = (1 << 64) - 1
 
 
@@ -76,33 +60,11 @@ class _CheckedMcapWriter(McapWriter):
         file.write(struct.pack('<I', checksum))
 
 
-class _SqliteWriter(Sqlite3Writer):
-    """rosbags' writer, which opens its file by the path and not by a URI.
-
-    In the URI `file:PATH` of rosbags `#`, `?` and `%` have a meaning: it would write another file.
-    """
-
-    def __init__(self, path: Path, compression: CompressionMode) -> None:
-        self.path = path.absolute() / f'{path.name}.db3'
-        self.conn = sqlite3.connect(self.path)
-        try:
-            # A bag gets its name after its files were synced. Until then it need not survive
-            # a power cut.
-            self.conn.execute('PRAGMA synchronous = OFF')
-            self.conn.execute('PRAGMA journal_mode = MEMORY')
-            self.conn.executescript(self.SQLITE_SCHEMA)
-        except BaseException:
-            self.conn.close()  # Nobody else can: there is no writer yet.
-            raise
-        self.cursor = self.conn.cursor()
-
-
 class BagWriter(Writer):
-    """rosbags' writer with these formats."""
+    """rosbags' writer with these checksums."""
 
     STORAGE_PLUGINS: Mapping[StoragePlugin, type[StorageWriter]] = {
-        StoragePlugin.MCAP: _CheckedMcapWriter,
-        StoragePlugin.SQLITE3: _SqliteWriter,
+        StoragePlugin.MCAP: _CheckedMcapWriter
     }
 
 
@@ -119,17 +81,15 @@ class Summary:
     """Time of the last message (ns)."""
     lost: dict[str, int] = field(default_factory=dict)
     """Messages that are known to be missing, by topic."""
-    left_out: tuple[str, ...] = ()
-    """Descriptions of records that are not in the bag because readers would refuse it with them."""
 
 
-def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
+def check_target(target: Path, *, replace: bool = False) -> None:
     """Check that a bag can have this path, before anything is recorded for it.
 
     Raises:
         FileExistsError: It exists, possibly as a broken symbolic link, and is not to be replaced or
             is not a bag.
-        OSError: Its name is not UTF-8, as metadata.yaml must be, or its path is too long for SQLite.
+        OSError: Its name is not UTF-8, as metadata.yaml must be.
     """
     if os.path.lexists(target):
         if not replace:
@@ -140,15 +100,6 @@ def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
         target.name.encode()
     except UnicodeEncodeError:
         raise OSError(errno.EILSEQ, f'the name of a bag must be UTF-8, got {target.name!a}') from None
-    if storage == 'sqlite3':
-        scratch = target.parent.resolve() / (scratch_prefix(target) + 8 * 'x')
-        length = len(os.fsencode(scratch / target.name / f'{target.name}.db3'))
-        if length > MAX_SQLITE_PATH:
-            raise OSError(
-                errno.ENAMETOOLONG,
-                f'the path is too long for SQLite: at most {MAX_SQLITE_PATH} bytes, got {length} with '
-                'the directory in which the bag is written',
-            )
 
 
 def _is_nothing_but_a_bag(path: Path) -> bool:
@@ -166,39 +117,35 @@ def build_bag(
     channels: Iterable[Channel],
     records: Iterable[Record],
     target: Path,
-    storage: str,
     *,
     replace: bool = False,
     compressed: bool = False,
 ) -> Summary:
     """Write records to a new bag, and give it its name after it was read back as readers do.
 
-    Messages and custom data that exceed the limits of the readers are left out.
-
     Args:
         channels: The topics, each with all its profiles.
         records: The messages and the custom data. Channels among them are not used.
         target: The bag's directory.
-        storage: `mcap` or `sqlite3`.
         replace: Whether it may replace another bag, which stays until the new one is complete.
-        compressed: Whether the chunks of an MCAP file are compressed by zstd.
+        compressed: Whether the chunks are compressed by zstd.
 
     Raises:
         OSError: As of `check_target`; or it cannot be written, or is not read back as it was written.
             It is removed then.
     """
-    check_target(target, storage, replace=replace)
+    check_target(target, replace=replace)
     with scratch_directory(target) as scratch:
         # The directory has the final name, after which rosbags names the files.
         bag = scratch / target.name
-        summary, written = _write(records, {one.id: one for one in channels}, bag, storage, compressed)
+        summary, written = _write(records, {one.id: one for one in channels}, bag, compressed)
         if _contents(bag) != written:
             raise OSError(errno.EIO, 'what was read back from it is not what was written to it')
         for path in bag.iterdir():
             _sync(path)
         _sync(bag)
         # Renaming would replace an empty directory that was created meanwhile.
-        check_target(target, storage, replace=replace)
+        check_target(target, replace=replace)
         if replace and target.exists():
             old = scratch / REPLACED
             os.rename(target, old)
@@ -226,9 +173,9 @@ class _Content:
 
 
 def _write(
-    records: Iterable[Record], channels: dict[int, Channel], path: Path, storage: str, compressed: bool
+    records: Iterable[Record], channels: dict[int, Channel], path: Path, compressed: bool
 ) -> tuple[Summary, _Content]:
-    writer = BagWriter(path, version=9, storage_plugin=STORAGES[storage])
+    writer = BagWriter(path, version=9, storage_plugin=StoragePlugin.MCAP)
     if compressed:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     content = _Content()
@@ -245,89 +192,31 @@ def _write(
             for channel in channels.values()
         }
         start = end = None
-        texts: dict[str, str] = {}
-        too_large: Counter[str] = Counter()
         for record in records:
             if isinstance(record, Text):
-                texts[record.key] = record.value
-            elif isinstance(record, Message) and len(record.data) > MAX_MESSAGE:
-                too_large[channels[record.channel].topic] += 1
+                writer.set_custom_data(record.key, record.value)
             elif isinstance(record, Message):
                 writer.write(connections[record.channel], record.stamp, record.data)
                 content.add(channels[record.channel].topic, record.stamp, record.data)
                 start = record.stamp if start is None else min(start, record.stamp)
                 end = record.stamp if end is None else max(end, record.stamp)
-        unwritten = _too_large(texts, writer.connections)
-        for key in texts.keys() - unwritten:
-            writer.set_custom_data(key, texts[key])
         writer.close()
-    except BaseException as error:
+    except BaseException:
         with suppress(Exception):
             # Closing would fail for the same reason as writing.
             writer.abort()
-        if isinstance(error, sqlite3.Error):
-            raise OSError(errno.EIO, str(error)) from error
         raise
-    left_out = describe_too_large(too_large)
-    left_out += [f'{printable(key)}: metadata.yaml would be too large' for key in unwritten]
     summary = Summary(
         messages=content.counts.total(),
         topics={channel.topic: content.counts[channel.topic] for channel in channels.values()},
         start=start,
         end=end,
-        left_out=tuple(left_out),
     )
     return summary, content
 
 
-def describe_too_large(messages: Mapping[str, int]) -> list[str]:
-    """Return descriptions of messages, counted by topic, that readers would refuse."""
-    return [
-        f'{printable(topic)}: {number} messages larger than {format_size(MAX_MESSAGE)}'
-        for topic, number in sorted(messages.items())
-    ]
-
-
-def _too_large(texts: dict[str, str], connections: Iterable[Connection]) -> list[str]:
-    """Return the keys of the largest custom data, without which readers accept metadata.yaml."""
-    topics = [
-        {
-            'topic_metadata': {
-                'name': one.topic,
-                'type': one.msgtype,
-                'serialization_format': one.ext.serialization_format,
-                'offered_qos_profiles': dump_qos_v9(one.ext.offered_qos_profiles),
-                'type_description_hash': one.digest,
-            },
-            'message_count': 2**63 - 1,
-        }
-        for one in connections
-        if isinstance(one.ext, ConnectionExtRosbag2)
-    ]
-    if _ESCAPED * (len(str(topics)) + sum(map(len, texts.values()))) + _REMAINDER <= MAX_SIZE:
-        return []
-    sizes = {key: _yaml_size({key: value}) for key, value in texts.items()}
-    excess = _REMAINDER + _yaml_size(topics) + sum(sizes.values()) - MAX_SIZE
-    largest = []
-    for key in sorted(sizes, key=sizes.__getitem__, reverse=True):
-        if excess <= 0:
-            break
-        largest.append(key)
-        excess -= sizes[key]
-    return largest
-
-
-def _yaml_size(content: object) -> int:
-    """Return the length of a value at its place in metadata.yaml (characters)."""
-    stream = StringIO()
-    yaml = YAML(typ='safe')
-    yaml.default_flow_style = False
-    yaml.dump({ROOT: {'custom_data': content}}, stream)
-    return len(stream.getvalue())
-
-
 def _contents(path: Path) -> _Content:
-    """Read a whole bag with the limits of all readers, or raise OSError."""
+    """Read a whole bag as all readers do, or raise OSError."""
     content = _Content()
     try:
         with open_bag(path) as reader:

@@ -3,32 +3,25 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import ReaderError
+from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from diffdrive_jacobian.bags.bag_reader import MetadataError, parse_parameters
-from diffdrive_jacobian.bags.bag_writer import STORAGES
-from diffdrive_jacobian.bags.bounded_reader import (
-    UNPACK_ERRORS,
-    Budget,
-    parse_bounded_qos,
-    unpack_file,
-    unpack_message,
-)
+from diffdrive_jacobian.bags.corrected_reader import UNPACK_ERRORS, zstd
 from diffdrive_jacobian.bags.files import (
     ZSTD,
-    NotABagError,
     NotARegularFileError,
     bag_files,
     check_regular,
@@ -48,13 +41,12 @@ from diffdrive_jacobian.bags.message_definitions import (
     known_definition,
 )
 from diffdrive_jacobian.bags.salvage import Topic, read_mcap, read_sqlite
-from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
+from diffdrive_jacobian.safe_yaml import YAML_ERRORS, load_yaml
 from diffdrive_jacobian.text import printable
 
-MAX_DEFINITION = 200_000
-"""Length of the longest definition of a type that is parsed; those of ROS have less than a tenth."""
 _PARSE_ERRORS = (TypesysError, LookupError, ValueError, AssertionError, RecursionError)
-READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}
+BLOCK = 1 << 20
+"""Size of the parts in which a file is decompressed (bytes)."""
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 LAST_ENCAPSULATION = 0x0B
 """Of CDR, in the second byte of a message; the first one is 0."""
@@ -82,11 +74,6 @@ def definition_and_hash(topic: Topic) -> tuple[str, str]:
         return topic.definition, topic.type_hash
     if not topic.definition:
         raise UnknownTypeError(reason)
-    if len(topic.definition) > MAX_DEFINITION:
-        raise UnknownTypeError(
-            f'{reason}, and its definition has {len(topic.definition)} characters; at most '
-            f'{MAX_DEFINITION} are parsed'
-        )
     try:
         return topic.definition, _hash(topic.definition, topic.type_name)
     except _PARSE_ERRORS as error:
@@ -129,8 +116,6 @@ class DamagedBag:
         """
         self.path = path
         files = bag_files(path)
-        self.storage = file_kind(files[0])
-        """Storage of a new bag that is like the old one, `mcap` or `sqlite3`."""
         self.lost: list[str] = []
         """Descriptions of what could not be read. This and the next two are complete after all records
         were read."""
@@ -253,12 +238,12 @@ class DamagedBag:
         ids: dict[int, int | None] = {}
         names: dict[int, str] = {}
         faults: Counter[str] = Counter()
-        budget = Budget(source.stat().st_size)
         start, end = 2**63, -1
         with open(source, 'rb') as file:
-            reader = READERS[file_kind(source)]
+            reader = partial(read_mcap, file)
+            if file_kind(source) == 'sqlite3':
+                reader = partial(read_sqlite, source)
             for one in reader(
-                file,
                 lambda what: self.lost.append(f'{name}: {what}'),
                 lambda what: self.unchecked.append(f'{name}: {what}'),
             ):
@@ -269,8 +254,6 @@ class DamagedBag:
                     for text in _custom_data(metadata):
                         yield from self._text(text)
                 elif isinstance(one, Text):
-                    if one.key == 'storage' and one.value in STORAGES:
-                        self.storage = one.value
                     yield from self._text(one)
                 elif isinstance(one, Topic):
                     known = channels.get((one.name, one.type_name))
@@ -286,9 +269,9 @@ class DamagedBag:
                     if one.channel not in ids:
                         faults['belong to no known topic'] += 1
                     elif (to := ids[one.channel]) is not None:
-                        data = _payload(one.data, budget)
+                        data = _payload(one.data)
                         if data is None or not 0 <= one.stamp < 2**63:
-                            faults['are not CDR, are too large, or have an invalid time'] += 1
+                            faults['are not CDR or have an invalid time'] += 1
                         else:
                             start, end = min(start, one.stamp), max(end, one.stamp)
                             yield Message(to, one.stamp, data)
@@ -322,27 +305,19 @@ class DamagedBag:
 
 
 def _unpacked(file: Path, scratch: Path) -> Path:
-    """Return the file, or a copy that is decompressed or includes the write-ahead log of SQLite."""
+    """Return the file, or a copy: of one that is compressed, or of SQLite, which may change it."""
     copy = Path(tempfile.mkdtemp(dir=scratch)) / file.name.removesuffix(ZSTD)
-    log = file.with_name(f'{file.name}-wal')
     if file.suffix == ZSTD:
-        try:
-            with open(copy, 'wb') as out:
-                unpack_file(file, out)
-        except TooLargeError as error:
-            raise NotABagError(str(error)) from error
-        except UNPACK_ERRORS:
-            # What was decompressed is read; the reader reports that it is cut off.
-            pass
+        # If it is cut off, what was decompressed is read; the reader reports the rest.
+        with suppress(*UNPACK_ERRORS), zstd.open(file, 'rb') as packed, open(copy, 'wb') as out:
+            while block := packed.read(BLOCK):
+                out.write(block)
         return copy
-    if log.is_file() and log.stat().st_size:
-        size = file.stat().st_size + log.stat().st_size
-        shutil.copyfile(file, copy)
-        shutil.copyfile(log, copy.with_name(log.name))
-        with suppress(sqlite3.Error), closing(sqlite3.connect(copy)) as database:
-            database.execute('PRAGMA wal_checkpoint(TRUNCATE)')
-        # A log can name any page number, and the copy would grow to that size.
-        return copy if copy.stat().st_size <= size else file
+    if file_kind(file) == 'sqlite3':
+        for ending in ('', '-wal', '-journal'):
+            with suppress(FileNotFoundError):
+                shutil.copyfile(f'{file}{ending}', f'{copy}{ending}')
+        return copy
     return file
 
 
@@ -355,7 +330,7 @@ def _metadata(source: Path | str) -> tuple[dict[str, Any], str]:
         if isinstance(source, Path):
             check_regular(source)
         found = load_yaml(source)
-    except (TooLargeError, NotARegularFileError) as error:
+    except NotARegularFileError as error:
         return {}, str(error)
     except (FileNotFoundError, *YAML_ERRORS):
         return {}, ''
@@ -392,12 +367,11 @@ def _custom_data(metadata: dict[str, Any]) -> Iterator[Text]:
         yield Text(*(str(one).encode('utf-8', 'replace').decode() for one in (key, value)))
 
 
-def _payload(data: bytes, budget: Budget) -> bytes | None:
-    """Return a message as CDR; None: it is not CDR, or unpacks to more than is allowed."""
+def _payload(data: bytes) -> bytes | None:
+    """Return a message as CDR; None: it is not CDR, or cannot be unpacked."""
     if data.startswith(ZSTD_MAGIC):
         try:
-            data = unpack_message(data)
-            budget.spend(len(data))
+            data = zstd.decompress(data)
         except UNPACK_ERRORS:
             return None
     return data if len(data) > 4 and data[0] == 0 and data[1] <= LAST_ENCAPSULATION else None
@@ -406,7 +380,7 @@ def _payload(data: bytes, budget: Budget) -> bytes | None:
 def _profiles(text: str) -> list[Qos]:
     """Return the offered profiles in the text of rosbag2 that are valid."""
     try:
-        profiles = parse_bounded_qos(text)
+        profiles = parse_qos(text)
     except (ReaderError, LookupError, TypeError, ValueError, AttributeError, *YAML_ERRORS):
         return []
     return [

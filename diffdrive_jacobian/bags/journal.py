@@ -14,7 +14,6 @@ from __future__ import annotations
 import fcntl
 import os
 import struct
-import tempfile
 import threading
 import zlib
 from contextlib import suppress
@@ -27,7 +26,6 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags import mcap
-from diffdrive_jacobian.bags.files import JOURNAL
 
 PARAMETERS = 'parameters of '
 """Followed by a node's name, the key of the custom data that holds its parameters as JSON."""
@@ -243,34 +241,6 @@ class JournalWriter:
             return os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno()))
         except OSError:
             return False
-
-    def rescue(self) -> Path:
-        """Return where a file that is not `in_place` was moved, or a copy of it if it was removed.
-
-        The copy is in the directory of `path`, or in the nearest one above that still exists. It is
-        complete when this returns.
-
-        Raises:
-            OSError: The copy cannot be written.
-        """
-        descriptor = self._file.fileno()
-        with suppress(OSError):
-            # Linux reports the present name.
-            moved = Path(os.readlink(f'/proc/self/fd/{descriptor}'))
-            if os.path.samestat(os.stat(moved), os.fstat(descriptor)):
-                return moved
-        path = Path(os.path.abspath(self.path))
-        folders = (*path.parents, Path(tempfile.gettempdir()))
-        folder = next(one for one in folders if one.is_dir() and os.access(one, os.W_OK))
-        bag = path.name.removesuffix(JOURNAL)
-        handle, name = tempfile.mkstemp(JOURNAL, f'{bag[:50]}_rescued_', folder)
-        with open(handle, 'wb') as copy:
-            # The content of a removed file can still be read.
-            while data := os.pread(descriptor, BLOCK, copy.tell()):
-                copy.write(data)
-            copy.flush()
-            os.fsync(copy.fileno())
-        return Path(name)
 
     def close(self) -> None:
         """Close the file; records that were not flushed are lost."""

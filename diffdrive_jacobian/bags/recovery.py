@@ -83,8 +83,6 @@ class Recovery:
     """What the recorder reported as lost, one description for each topic."""
     topics_left_out: bool
     """Whether there are topics whose messages were read but could not be written."""
-    records_left_out: bool
-    """Whether there are records that were read but are too large for a bag."""
     undecodable: tuple[str, ...]
     """Descriptions of messages that were saved but cannot be decoded, and of topics not checked."""
 
@@ -92,7 +90,6 @@ class Recovery:
 def recover(
     what: Path,
     output: Path | None = None,
-    storage: str | None = None,
     *,
     replace: bool = False,
     interrupted: Callable[[], bool] = lambda: False,
@@ -102,7 +99,6 @@ def recover(
     Args:
         what: A bag's directory, one of its files, a journal, or the bag that a journal belongs to.
         output: The new bag's directory. By default it is beside the old one.
-        storage: `mcap` or `sqlite3`. By default that of the old bag.
         replace: Whether the new bag may replace another one than the old one.
         interrupted: Is called for each record; once it returns True nothing is left of the new bag.
 
@@ -156,18 +152,16 @@ def recover(
             survey.channels.values(),
             islice(records(), surveyed),
             target,
-            storage or old.storage,
             replace=replace,
         )
         return Recovery(
             bag=target,
             summary=summary,
             damaged=damaged,
-            lost=lost + summary.left_out,
+            lost=lost,
             unchecked=unchecked,
             lost_before=_lost_before(survey.notes),
             topics_left_out=left_out,
-            records_left_out=bool(summary.left_out),
             undecodable=undecodable,
         )
 

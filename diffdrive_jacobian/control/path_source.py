@@ -185,7 +185,7 @@ def _column_names(cells: list[str]) -> dict[int, str]:
 def _read_yaml(file: FilePath) -> dict[str, Floats]:
     """Return the columns of a YAML file. Errors give the number of the pose."""
     # ruamel.yaml takes time to import, and the laws do not need it.
-    from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, load_yaml
+    from diffdrive_jacobian.safe_yaml import YAML_ERRORS, load_yaml
 
     try:
         content = load_yaml(file)

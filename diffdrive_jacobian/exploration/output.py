@@ -226,7 +226,7 @@ def record(setting: Setting, trial: Trial, only: int, folder: str) -> list[str]:
     @contextmanager
     def recording(world: Lockstep) -> Iterator[None]:
         nonlocal ended
-        writing = Recording(bag, 'mcap', lossless=True)
+        writing = Recording(bag, lossless=True)
         recorder = Recorder(Selection(everything=True), writing)
         world.add(recorder, observer=True)
         world.on_new_topics(recorder.discover)

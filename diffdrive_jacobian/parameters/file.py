@@ -22,14 +22,13 @@ def sections(path: str) -> Sections:
         UserError: The file cannot be read or is not a ROS parameter file.
     """
     # Slow to import.
-    from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, load_yaml
+    from diffdrive_jacobian.safe_yaml import YAML_ERRORS, load_yaml
 
     try:
-        content = load_yaml(Path(path))
+        return list(_sections(load_yaml(Path(path)), ''))
     except (OSError, *YAML_ERRORS) as error:
         why = printable(' '.join(str(error).split()), 200)
         raise UserError(f'--params-file must be a file of ROS parameters, got {path}: {why}') from error
-    return list(_sections(content, ''))
 
 
 def robot_parameters(path: str) -> dict[str, Any]:

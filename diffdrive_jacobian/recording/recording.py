@@ -14,13 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from diffdrive_jacobian import __version__
-from diffdrive_jacobian.bags.bag_writer import (
-    Summary,
-    build_bag,
-    check_target,
-    describe_too_large,
-)
-from diffdrive_jacobian.bags.bounded_reader import MAX_MESSAGE
+from diffdrive_jacobian.bags.bag_writer import Summary, build_bag, check_target
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import (
     LEFT_OUT,
@@ -155,7 +149,6 @@ class Recording:
     def __init__(
         self,
         bag: Path,
-        storage: str,
         *,
         lossless: bool = False,
         replace: bool = False,
@@ -164,7 +157,6 @@ class Recording:
 
         Args:
             bag: Directory of the bag. Its journal must not exist.
-            storage: `mcap` or `sqlite3`.
             lossless: Whether `add` waits for a disk that is too slow. Otherwise messages are dropped.
             replace: Whether the bag may replace another one, which stays until then.
 
@@ -172,7 +164,7 @@ class Recording:
             FileExistsError: The journal exists, or the bag, and it is not to be replaced or is no bag.
             OSError: They cannot be written there.
         """
-        check_target(bag, storage, replace=replace)
+        check_target(bag, replace=replace)
         journal = journal_of(bag)
         if journal.exists():
             raise FileExistsError(
@@ -180,20 +172,17 @@ class Recording:
             )
         self.bag = bag
         self.journal = JournalWriter(journal)
-        self._storage = storage
         self._replace = replace
         self.started = time.monotonic()
         self._channels: dict[int, Channel] = {}
         self._added: Counter[int] = Counter()
         self._dropped: Counter[int] = Counter()
-        self._too_large: Counter[int] = Counter()
         self._missed: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
         self._noted: list[Text] = []
         self._unread: list[str] = []
         self._open = True
         self.journal.add(Text('recorder', f'diffdrive_jacobian {__version__}'))
-        self.journal.add(Text('storage', storage))
         try:
             self.journal.flush()
         except OSError:
@@ -211,9 +200,8 @@ class Recording:
     def lost(self) -> dict[str, int]:
         """Number of messages known to be lost so far, by topic."""
         lost = Counter(dict(self._missed))
-        for counts in (self._dropped, self._too_large):
-            for topic, number in self._by_topic(counts).items():
-                lost[topic] += number
+        for channel, number in list(self._dropped.items()):
+            lost[self._channels[channel].topic] += number
         return {topic: number for topic, number in sorted(lost.items()) if number}
 
     def add(self, record: Record) -> None:
@@ -224,9 +212,7 @@ class Recording:
             self._channels[record.id] = record
         added = self._thread.add(record)
         if isinstance(record, Message):
-            # Messages that are too large for a bag stay in the journal, which other tools can read.
-            kept = self._too_large if len(record.data) > MAX_MESSAGE else self._added
-            (kept if added else self._dropped)[record.channel] += 1
+            (self._added if added else self._dropped)[record.channel] += 1
 
     def set_missed(self, topic: str, messages: int) -> None:
         """Set the number of messages of a topic that are known to be missed so far."""
@@ -252,18 +238,20 @@ class Recording:
         self._thread.close()
         journal = self.journal.path
         if not self.journal.in_place():
-            self._raise_gone()
+            self.journal.close()
+            raise RecordingError(
+                f'{journal} was removed, renamed or replaced while it was being recorded: no bag is '
+                'written. If the file still exists elsewhere, recover_run writes the bag from it'
+            )
         try:
             if self.error is not None:
                 # Messages that were queued, but could not be written, are lost.
                 written = Counter(one.channel for one in self._read() if isinstance(one, Message))
-                self._dropped += self._added - written + self._too_large
-                self._too_large.clear()
+                self._dropped += self._added - written
             summary = build_bag(
                 self._channels.values(),
                 chain(self._read(), self._notes()),
                 self.bag,
-                self._storage,
                 replace=self._replace,
             )
         # Whatever rosbags raises: the user must know that the journal exists.
@@ -288,11 +276,9 @@ class Recording:
                 f'{summary.messages}. The journal {journal} is kept',
                 summary,
             )
-        left_out = describe_too_large(self._by_topic(self._too_large))
-        left_out += [*self._unread, *summary.left_out]
-        if left_out:
+        if self._unread:
             raise RecordingError(
-                f'{self.bag} does not contain all that was recorded: {"; ".join(left_out)}. '
+                f'{self.bag} does not contain all that was recorded: {"; ".join(self._unread)}. '
                 f'The journal {journal} is kept',
                 summary,
             )
@@ -321,14 +307,8 @@ class Recording:
                     numbers[found.id] = ids[found.name, found.type_name]
                 elif isinstance(found, Text):
                     yield found
-                elif isinstance(found, Message) and len(found.data) <= MAX_MESSAGE:
+                elif isinstance(found, Message):
                     yield Message(numbers[found.channel], found.stamp, found.data)
-
-    def _by_topic(self, counts: Counter[int]) -> Counter[str]:
-        by_topic: Counter[str] = Counter()
-        for channel, number in list(counts.items()):
-            by_topic[self._channels[channel].topic] += number
-        return by_topic
 
     def _notes(self) -> list[Text]:
         """Return the losses so far as entries of the custom data."""
@@ -345,7 +325,7 @@ class Recording:
 
     def _missing(self) -> str:
         """Return how many messages are neither in the journal nor in the bag; '': none that is known."""
-        number = sum(self.lost.values()) - self._too_large.total()
+        number = sum(self.lost.values())
         return f'. {number} {"message is" if number == 1 else "messages are"} missing' if number else ''
 
     def _describe_losses(self) -> str:
@@ -362,22 +342,9 @@ class Recording:
         ]
         return '; '.join(parts)
 
-    def _raise_gone(self) -> None:
-        journal = self.journal.path
-        what = f'{journal} was removed, renamed or replaced while it was being recorded'
-        try:
-            found = self.journal.rescue()
-        except OSError as error:
-            raise RecordingError(f'{what}, and its content cannot be saved: {error}') from error
-        finally:
-            self.journal.close()
-        raise RecordingError(
-            f'{what}. The recorded messages are in {found}: recover_run {found} writes the bag from it'
-        )
-
 
 def open_recording(
-    prefix: str, output: str | None, storage: str, *, lossless: bool = False, replace: bool = False
+    prefix: str, output: str | None, *, lossless: bool = False, replace: bool = False
 ) -> Recording:
     """Start a recording to a path of the user, or in the current directory as `PREFIX_DATE-TIME`.
 
@@ -386,11 +353,11 @@ def open_recording(
     """
     try:
         if output is not None:
-            return Recording(Path(output), storage, lossless=lossless, replace=replace)
+            return Recording(Path(output), lossless=lossless, replace=replace)
         for name in names_by_time(prefix):
             # Other processes may take the same name.
             with suppress(FileExistsError):
-                return Recording(Path(name), storage, lossless=lossless)
+                return Recording(Path(name), lossless=lossless)
     except OSError as error:
         where = output or 'this directory'
         raise OSError(f'cannot record to {where}: {(error.strerror or str(error)).lower()}') from error

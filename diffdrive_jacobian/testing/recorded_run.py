@@ -69,7 +69,7 @@ class RecordedRun:
         directory.mkdir(parents=True, exist_ok=True)
         for old in (journal_of(bag), _figure_of(bag)):
             old.unlink(missing_ok=True)
-        self._recording = Recording(bag, 'mcap', lossless=True, replace=True)
+        self._recording = Recording(bag, lossless=True, replace=True)
         if bag.exists():
             # A bag, as the recording has checked.
             shutil.rmtree(bag)
@@ -399,4 +399,4 @@ def _store(bag: Path, target: Path, omitted: set[str]) -> None:
             Message(channels[connection.id].id, time, data)
             for connection, time, data in messages(reader, connections)
         ]
-    build_bag(channels.values(), [*texts, *data], target, 'mcap', replace=True, compressed=True)
+    build_bag(channels.values(), [*texts, *data], target, replace=True, compressed=True)

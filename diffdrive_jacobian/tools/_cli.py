@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from diffdrive_jacobian import __version__
 from diffdrive_jacobian.errors import UserError
@@ -346,15 +346,15 @@ class Parser(argparse.ArgumentParser):
         """Add the option to overwrite what is named."""
         self.add_argument('--force', action='store_true', help=f'overwrite {what} (default: refuse)')
 
-    def add_storage(self, default: str | None = None) -> None:
-        """Add the option for the file format of a bag to write. None: that of the bag that is read."""
-        self.add_argument(
-            '-s',
-            '--storage',
-            choices=('mcap', 'sqlite3'),
-            default=default,
-            help=f'storage format (default: {default or "that of BAG"})',
-        )
+    def refuse_storage(self) -> None:
+        """Refuse `--storage`, which the programs of rosbag2 have."""
+
+        def refuse(storage: str) -> NoReturn:
+            raise argparse.ArgumentTypeError(
+                f'bags are written as MCAP, got {storage!r}; `ros2 bag convert` writes other formats'
+            )
+
+        self.add_argument('-s', '--storage', type=refuse, help=argparse.SUPPRESS)
 
     def add_params_file(self, text: str = 'file of ROS parameters (YAML)') -> None:
         """Add the options for a parameter file without `--ros-args`: its path, or the robot's name."""

@@ -54,7 +54,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     if not options.no_record:
         try:
             recording = open_recording(
-                'drive', options.output, 'mcap', lossless=options.lockstep, replace=options.force
+                'drive', options.output, lossless=options.lockstep, replace=options.force
             )
         except OSError as error:
             return _output.complain(PROGRAM, error)

@@ -102,7 +102,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         pattern=options.regex or '',
     )
     try:
-        recording = open_recording('run', options.output, options.storage, replace=options.force)
+        recording = open_recording('run', options.output, replace=options.force)
     except OSError as error:
         return _output.complain(PROGRAM, error)
     bag = recording.bag
@@ -188,7 +188,7 @@ def _parser() -> _cli.Parser:
     )
     parser.add_output('BAG', 'directory of the bag (default: run_DATE-TIME)', kind=_cli.bag_folder)
     parser.add_force('BAG, at the end of the recording')
-    parser.add_storage(default='mcap')
+    parser.refuse_storage()
     parser.add_argument('-a', '--all', action='store_true', help='record every topic that is not hidden')
     parser.add_argument(
         '-e',

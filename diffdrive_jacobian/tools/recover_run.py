@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,7 +37,6 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             recovery = recover(
                 options.bag,
                 options.output,
-                options.storage,
                 replace=options.force,
                 interrupted=lambda: signals.count > 0,
             )
@@ -51,12 +49,12 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         return UNCHECKED if isinstance(error, UncheckedError) else FAILED
     except (NotABagError, FileExistsError) as error:
         return _output.complain(PROGRAM, error)
-    except (OSError, sqlite3.Error) as error:
+    except OSError as error:
         wrong = isinstance(error, PermissionError | FileNotFoundError | NotADirectoryError)
         code = USER_ERROR if wrong else FAILED
         return _output.complain(PROGRAM, f'no bag was written: {error}', code)
     print(report(recovery))
-    return FAILED if recovery.topics_left_out or recovery.records_left_out else DONE
+    return FAILED if recovery.topics_left_out else DONE
 
 
 def report(recovery: Recovery) -> str:
@@ -88,7 +86,7 @@ def _parser() -> _cli.Parser:
         'full disk has left incomplete, and report what was saved and what was lost. The original is '
         'not changed. Exit code 0: all that could be read is in the new bag; 1: nothing to recover (the '
         'bag is complete, or no message can be read), or the disk is full, or topics were left out '
-        'because their type is unknown, or records because they are too large; 2: wrong arguments; '
+        'because their type is unknown; 2: wrong arguments; '
         '3: nothing to recover (nothing was found missing, but not all could be checked, for want of '
         'checksums or counts); 130: interrupted.',
     )
@@ -102,5 +100,5 @@ def _parser() -> _cli.Parser:
         kind=Path,
     )
     parser.add_force('NEW, which must not be BAG')
-    parser.add_storage()
+    parser.refuse_storage()
     return parser

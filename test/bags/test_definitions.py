@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
-from support.bags import SECOND, odom, write_bag
+from support.bags import SECOND, odom, write_bag, write_sqlite
 from support.raw_bags import channel
 
 from diffdrive_jacobian.bags import read_run
@@ -193,7 +193,8 @@ def test_messages_of_another_definition_are_reported_and_not_misread(tmp_path, s
     odometry, other = (channel(index, f'/{index}', 'nav_msgs/msg/Odometry') for index in (0, 1))
     odometry = replace(odometry, topic='/odom', definition='float64 x\n', type_hash=OTHER_HASH)
     data = [Message(0, SECOND, serialize_message(odom(1.0, 2.0, 0.5)))]
-    build_bag([odometry, other], data, tmp_path / 'bag', storage)
+    write = write_sqlite if storage == 'sqlite3' else build_bag
+    write([odometry, other], data, tmp_path / 'bag')
     run = read_run(tmp_path / 'bag')
     assert len(run.odometry) == 0
     assert run.skipped == {'/odom': 1}

@@ -6,10 +6,10 @@ from contextlib import closing, suppress
 from io import BytesIO
 
 import pytest
+from rosbags.rosbag2.metadata import parse_qos
 from support.raw_bags import LATCHED, mcap_records
 
 from diffdrive_jacobian.bags import journal, mcap
-from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.salvage import Topic, read_mcap
@@ -104,7 +104,7 @@ def test_profiles_that_are_offered_later_are_those_of_the_same_topic(written):
     found = list(read_mcap(BytesIO(data), pytest.fail, lambda doubt: None))
     topics = [one for one in found if isinstance(one, Topic) and one.name == '/t0']
     assert len({one.id for one in topics}) == len(topics) == 2
-    profiles = [parse_bounded_qos(one.qos) for one in topics]
+    profiles = [parse_qos(one.qos) for one in topics]
     assert profiles == [[LATCHED._replace(depth=depth)] for depth in (10, 7)]
     assert [one.channel for one in found if isinstance(one, Message)] == [one.id for one in topics]
 

@@ -156,7 +156,7 @@ def test_messages_that_cannot_be_decoded_are_skipped_and_counted(tmp_path):
     others = (b'', b'\0\1\0\0', b'\xff' * 300, bytes(720))
     damaged = [Message(0, SECOND, data) for data in others]
     records = [good, *damaged, good]
-    build_bag([channel(0, '/odom', 'nav_msgs/msg/Odometry')], records, tmp_path / 'bag', 'mcap')
+    build_bag([channel(0, '/odom', 'nav_msgs/msg/Odometry')], records, tmp_path / 'bag')
     run = read_run(tmp_path / 'bag')
     assert run.odometry.values[:, 0].tolist() == [1.0, 1.0]
     assert run.skipped == {'/odom': 4}

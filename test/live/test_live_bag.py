@@ -24,7 +24,7 @@ from diffdrive_jacobian.recording.recording import Recording
 def bag(tmp_path_factory):
     """A drive over two goals."""
     path = tmp_path_factory.mktemp('live') / 'tour'
-    recording = Recording(path, 'mcap', lossless=True)
+    recording = Recording(path, lossless=True)
     drive([[0.4, 0.0], [0.4, 0.4]], lockstep=True, parameters=QUICK, recording=recording)
     recording.finish()
     return path

@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from support.recorded import LockstepRecording
 
-from diffdrive_jacobian.bags.bounded_reader import BoundedReader
+from diffdrive_jacobian.bags.corrected_reader import CorrectedReader
 from diffdrive_jacobian.bags.journal import PARAMETERS
 from diffdrive_jacobian.recording import parameter_query
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
@@ -92,7 +92,7 @@ def recorded_parameters(lockstep, tmp_path, *strangers):
     recording.finish()
     # Whatever they answer, their messages are recorded.
     assert recording.summary.topics['/cmd_vel'] == len(strangers)
-    reader = BoundedReader(tmp_path / 'run')
+    reader = CorrectedReader(tmp_path / 'run')
     reader.open()
     texts = dict(reader.storage.metadata.custom)
     reader.close()

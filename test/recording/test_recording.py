@@ -9,21 +9,18 @@ import shutil
 import stat
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
 from support.raw_bags import channel, read_journal
 
-from diffdrive_jacobian import bounded_yaml
-from diffdrive_jacobian.bags import bag_reader, bounded_reader, journal, recover
+from diffdrive_jacobian.bags import bag_reader, journal, recover
 from diffdrive_jacobian.bags import bag_writer as building
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import (
     LEFT_OUT,
-    PARAMETERS,
     Message,
     Text,
 )
@@ -39,7 +36,6 @@ pytestmark = pytest.mark.usefixtures('quick_disk')
 
 PATIENCE = 20.0
 NEVER = threading.Event()
-STORAGES = ('mcap', 'sqlite3')
 STRANGE_NAMES = ('run#2', 'run?mode=memory', 'run%41', 'file:x', ':memory:', "it's ü")
 CHANNEL = channel(8, '/cmd_vel', 'geometry_msgs/msg/Twist')
 
@@ -53,9 +49,9 @@ def messages(count, size=40):
     ]
 
 
-def recorded(path, *records, storage='mcap', **options):
+def recorded(path, *records, **options):
     """Return a recording of these records of the topic /cmd_vel."""
-    recording = Recording(path, storage, **options)
+    recording = Recording(path, **options)
     add_all(recording, CHANNEL, *records)
     return recording
 
@@ -133,45 +129,26 @@ def disk(monkeypatch):
 # --- Paths
 
 
-@pytest.mark.parametrize('storage', STORAGES)
-def test_a_bag_can_have_any_path_also_behind_a_symbolic_link(tmp_path, monkeypatch, storage):
+def test_a_bag_can_have_any_path_also_behind_a_symbolic_link(tmp_path, monkeypatch):
     (tmp_path / 'link?').symlink_to('real#')
     for name in STRANGE_NAMES:
         folder = tmp_path / 'real#' / name
         folder.mkdir(parents=True)
         monkeypatch.chdir(tmp_path / 'link?' / name)
         bag = Path(name)
-        assert recorded(bag, *messages(3), storage=storage).finish().messages == 3
+        assert recorded(bag, *messages(3)).finish().messages == 3
         assert os.listdir(folder) == [str(bag)]
-        file = f'{bag}.{"mcap" if storage == "mcap" else "db3"}'
+        file = f'{bag}.mcap'
         assert sorted(os.listdir(bag)) == sorted([file, 'metadata.yaml'])
         described = YAML(typ='safe').load(bag / 'metadata.yaml')['rosbag2_bagfile_information']
         assert described['relative_file_paths'] == [file]
         assert content(folder / bag) == [one.data for one in messages(3)]
 
 
-def nested(folder, length):
-    """Create a directory whose path has this length (bytes)."""
-    while (missing := length - len(os.fsencode(folder)) - 1) > 0:
-        # Not a name that leaves just the separator of the next one.
-        folder = folder / ('d' * (missing if missing <= 100 else 98))
-    folder.mkdir(parents=True)
-    return folder
-
-
-def test_paths_that_no_bag_can_have_are_refused_before_recording(tmp_path):
+def test_a_name_that_no_bag_can_have_is_refused_before_recording(tmp_path):
     with pytest.raises(OSError, match='must be UTF-8'):
-        Recording(tmp_path / os.fsdecode(b'run\xff'), 'mcap')
-    # SQLite has a limit. Below the path: .run.building-xxxxxxxx/run/run.db3
-    longest = 504 - len('/.run.building-xxxxxxxx/run/run.db3')
-    fits = nested(tmp_path / 'fits', longest)
-    assert recorded(fits / 'run', *messages(3), storage='sqlite3').finish().messages == 3
-    too_long = nested(tmp_path / 'long', longest + 1)
-    with pytest.raises(OSError, match='too long for SQLite: at most 504 bytes, got 505'):
-        Recording(too_long / 'run', 'sqlite3')
-    assert os.listdir(too_long) == []
-    Recording(too_long / 'run', 'mcap').discard()
-    assert os.listdir(too_long) == []
+        Recording(tmp_path / os.fsdecode(b'run\xff'))
+    assert os.listdir(tmp_path) == []
 
 
 def test_the_journal_stays_if_the_bag_reads_back_otherwise(tmp_path, monkeypatch):
@@ -218,7 +195,7 @@ def test_a_folder_of_the_user_stays(tmp_path):
 
 def busy(path, disk):
     """Return a recording whose thread waits for the disk, with one message."""
-    recording = Recording(path, 'mcap')
+    recording = Recording(path)
     disk.ready.clear()
     add_all(recording, CHANNEL, *messages(1))
     until(lambda: disk.writes, 'the thread writes')
@@ -260,7 +237,7 @@ def test_memory_is_bounded_and_what_is_dropped_is_counted(tmp_path, disk, monkey
 
 def test_a_message_larger_than_the_memory_is_taken_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(recordings, 'CAPACITY', 1_000)
-    recording = Recording(tmp_path / 'run', 'mcap')
+    recording = Recording(tmp_path / 'run')
     add_all(recording, CHANNEL)
     until(lambda: recording.journal.waiting == 0, 'all is written')
     add_all(recording, *messages(1, size=100_000))
@@ -269,7 +246,7 @@ def test_a_message_larger_than_the_memory_is_taken_alone(tmp_path, monkeypatch):
 
 def test_a_lossless_recording_waits_for_the_disk(tmp_path, disk, monkeypatch):
     monkeypatch.setattr(recordings, 'CAPACITY', 2_000)
-    recording = Recording(tmp_path / 'run', 'mcap', lossless=True)
+    recording = Recording(tmp_path / 'run', lossless=True)
     add_all(recording, CHANNEL)
     disk.ready.clear()
     release = threading.Timer(0.05, disk.ready.set)
@@ -319,7 +296,7 @@ WAYS = {
 
 
 @pytest.mark.parametrize('change', WAYS)
-def test_a_journal_that_goes_is_noticed_and_saved(tmp_path, change):
+def test_a_journal_that_goes_is_noticed(tmp_path, change):
     folder = tmp_path / 'runs'
     folder.mkdir()
     recording = recorded(folder / 'run', *messages(50))
@@ -327,28 +304,16 @@ def test_a_journal_that_goes_is_noticed_and_saved(tmp_path, change):
     until(lambda: recording.error is not None, 'it is noticed')
     error = failed(recording, 'was removed, renamed or replaced')
     assert error.summary is None
-    saved = str(error).split('The recorded messages are in ')[1].split(': recover_run')[0]
-    recover(Path(saved), tmp_path / 'new')
-    assert content(tmp_path / 'new') == [one.data for one in messages(50)]
+    assert not (folder / 'run').exists()
     if change == 'replace':
         assert journal_of(folder / 'run').read_text() == 'of somebody else'
-
-
-def test_a_journal_that_went_and_cannot_be_saved_is_reported(tmp_path, monkeypatch):
-    recording = Recording(tmp_path / 'run', 'mcap')
-    journal_of(tmp_path / 'run').unlink()
-    until(lambda: recording.error is not None, 'it is noticed')
-
-    def full():
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(recording.journal, 'rescue', full)
-    with pytest.raises(RecordingError, match=r'content cannot be saved: .*No space left'):
-        recording.finish()
+    elif change == 'rename':
+        recover(folder / 'elsewhere.journal.mcap')
+        assert content(folder / 'elsewhere') == [one.data for one in messages(50)]
 
 
 def test_discarding_keeps_a_file_of_another_process(tmp_path):
-    recording = Recording(tmp_path / 'run', 'mcap')
+    recording = Recording(tmp_path / 'run')
     replace_journal(tmp_path)
     recording.discard()
     assert journal_of(tmp_path / 'run').read_text() == 'of somebody else'
@@ -378,68 +343,17 @@ def test_what_was_missed_or_left_out_is_reported_also_after_a_crash(tmp_path):
     assert '/topic_0 was not recorded: it has several types' in recovery.lost_before
 
 
-# --- What readers would refuse
-
-
-def test_custom_data_that_readers_would_refuse_stays_in_the_journal(tmp_path, monkeypatch):
-    for module in (bounded_yaml, building):
-        monkeypatch.setattr(module, 'MAX_SIZE', 60_000, raising=False)
-    recording = Recording(tmp_path / 'run', 'sqlite3')
-    large = {
-        f'{PARAMETERS}/robot_{index}': json.dumps({'text': "it's " * 2_000 * (index + 1)})
-        for index in range(4)
-    }
-    add_all(recording, CHANNEL, *messages(3), *(Text(*one) for one in large.items()))
-    error = failed(recording, r'robot_3.*too large.*run\.journal\.mcap is kept')
-    assert error.summary.messages == 3
-    kept = custom_data(tmp_path / 'run')
-    assert len(content(tmp_path / 'run')) == 3
-    assert kept['storage'] == 'sqlite3'
-    assert f'{PARAMETERS}/robot_0' in kept
-    assert len(large) > sum(key in kept for key in large)
-    recovery = recover(journal_of(tmp_path / 'run'), tmp_path / 'again')
-    assert recovery.records_left_out
-    assert any('robot_3: metadata.yaml would be too large' in one for one in recovery.lost)
-
-
-def test_a_message_that_readers_would_refuse_stays_in_the_journal(tmp_path, monkeypatch):
-    monkeypatch.setattr(bounded_reader, 'MAX_RECORD', 500_000)
-    for module in (building, recordings):
-        monkeypatch.setattr(module, 'MAX_MESSAGE', 300_000)
-    monkeypatch.setattr(journal, 'BLOCK', 100_000)
-    sizes = (40, 400_000, 600_000, 40)
-    records = [one for size in sizes for one in messages(1, size=size)]
-    error = failed(recorded(tmp_path / 'run', *records), '/cmd_vel: 2 messages larger than 300')
-    summary = error.summary
-    assert (summary.messages, summary.lost) == (2, {'/cmd_vel': 2})
-    assert losses(tmp_path / 'run') == {'/cmd_vel': 2}
-    assert len(content(tmp_path / 'run')) == 2
-    recovery = recover(journal_of(tmp_path / 'run'), tmp_path / 'again')
-    assert recovery.records_left_out
-    lost = ' '.join(recovery.lost)
-    assert '/cmd_vel: 1 messages larger than 300.0 kB' in lost
-    assert 'it unpacks to 600.0 kB; at most 500.0 kB are read' in lost
-
-
-def test_more_than_the_readers_unpack_at_once_can_be_recorded_at_one_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(bounded_reader, 'MAX_OVERLAP', 4_000_000)
-    records = [replace(one, stamp=7) for one in messages(12, size=1_000_000)]
-    assert recorded(tmp_path / 'run', *records).finish().messages == 12
-    assert content(tmp_path / 'run') == [one.data for one in records]
-
-
 # --- File systems that lack something
 
 
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_all_files_are_synchronized_before_the_bag_gets_its_name(tmp_path, monkeypatch, storage):
+def test_all_files_are_synchronized_before_the_bag_gets_its_name(tmp_path, monkeypatch):
     synced, rename = [], os.rename
     before: list[list[str]] = []
     monkeypatch.setattr(
         os, 'fsync', lambda descriptor: synced.append(os.readlink(f'/proc/self/fd/{descriptor}'))
     )
     monkeypatch.setattr(os, 'rename', lambda *paths: before.append(list(synced)) or rename(*paths))
-    recording = recorded(tmp_path / 'run', *messages(3), storage=storage)
+    recording = recorded(tmp_path / 'run', *messages(3))
     until(lambda: str(journal_of(tmp_path / 'run')) in synced, 'the thread syncs the journal')
     recording.finish()
     assert len(before) == 1

@@ -9,6 +9,7 @@ from action_msgs.msg import GoalStatus
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
+from rosbags.rosbag2 import StoragePlugin, Writer
 from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags.bag_writer import build_bag
@@ -31,8 +32,28 @@ def write_bag(path, sent, *, parameters=None, storage='mcap'):
         received = round(seconds * SECOND)
         data.append(Message(channels[topic, name].id, received, serialize_message(message)))
     texts = [Text(PARAMETERS + node, json.dumps(values)) for node, values in (parameters or {}).items()]
-    build_bag(channels.values(), [*texts, *data], path, storage)
+    if storage == 'sqlite3':
+        write_sqlite(channels.values(), [*texts, *data], path)
+    else:
+        build_bag(channels.values(), [*texts, *data], path)
     return path
+
+
+def write_sqlite(channels, records, path):
+    """Write a bag as SQLite, by rosbags."""
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    with writer:
+        connections = {
+            one.id: writer.add_connection(
+                one.topic, one.type_name, msgdef=one.definition, rihs01=one.type_hash
+            )
+            for one in channels
+        }
+        for record in records:
+            if isinstance(record, Text):
+                writer.set_custom_data(record.key, record.value)
+            else:
+                writer.write(connections[record.channel], record.stamp, record.data)
 
 
 def count_more(bag, topic, more):

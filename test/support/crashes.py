@@ -31,9 +31,9 @@ class Control:
         self.harness.add(VirtualRobot)
         self.harness.until(lambda: self.heard, 'the robot is heard')
 
-    def record(self, bag, storage):
+    def record(self, bag):
         """Start to record; returns the recorder once messages are in its journal."""
-        recorder = self.world.start('record_run', '-o', str(bag), '-s', storage)
+        recorder = self.world.start('record_run', '-o', str(bag))
         # The first ones may be those that are latched.
         self.harness.until(lambda: recorded(bag) > LATCHED, 'odometry is recorded')
         return recorder
@@ -69,9 +69,9 @@ def odometry(bag):
     return [data for topic, _, data in read_bag(bag) if topic == '/odom']
 
 
-def crash(control, bag, storage, seconds, run):
+def crash(control, bag, seconds, run):
     """Record for so long, kill the recorder and recover; return the loss (s) and how many are saved."""
-    recorder = control.record(bag, storage)
+    recorder = control.record(bag)
     control.after(seconds)
     recorder.signal(signal.SIGKILL)
     last = control.heard[-1]

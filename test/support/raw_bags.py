@@ -12,7 +12,7 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 from diffdrive_jacobian.bags.files import journal_of
-from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
+from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.salvage import read_mcap
 from diffdrive_jacobian.signals import Signals
@@ -100,11 +100,11 @@ def write_records(bag, *records):
     return writer.path
 
 
-def write_journal(bag, messages, storage='mcap'):
+def write_journal(bag, messages):
     """Write what record_run leaves when it is killed."""
     channels = {one: channel(number, one, name) for number, (one, name) in enumerate(TOPICS.items())}
     records = (Message(channels[topic].id, stamp, data) for topic, stamp, data in messages)
-    return write_records(bag, Text('storage', storage), *channels.values(), *records)
+    return write_records(bag, *channels.values(), *records)
 
 
 def read_journal(path):

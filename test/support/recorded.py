@@ -12,9 +12,9 @@ from diffdrive_jacobian.recording.recording import Recording
 class LockstepRecording:
     """Records what is said in a world from its making on."""
 
-    def __init__(self, world, path, storage='mcap', **selection):
+    def __init__(self, world, path, **selection):
         self.world = world
-        self.recording = Recording(path, storage, lossless=True)
+        self.recording = Recording(path, lossless=True)
         self.recorder = world.add(Recorder(Selection(**selection), self.recording))
 
     def look(self):

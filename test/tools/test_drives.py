@@ -70,7 +70,7 @@ def test_a_drive_returns_the_outcome_and_reports_its_progress():
 
 def test_drives_in_lockstep_are_reproducible_and_recorded_where_the_caller_says():
     parameters = {'controller': 'offset_point', 'offset': 0.2, **QUICK}
-    recording = Recording(Path('bag'), 'mcap', lossless=True)
+    recording = Recording(Path('bag'), lossless=True)
     first = drive([[0.3, 0.1]], lockstep=True, parameters=parameters, recording=recording)
     recording.finish()
     second = drive([[0.3, 0.1]], lockstep=True, parameters=parameters)

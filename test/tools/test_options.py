@@ -134,9 +134,9 @@ def test_a_replay_says_which_subscriptions_it_waits_for(robots, capfd):
 
 def test_a_bag_replaces_another_one_only_if_asked(tmp_path):
     target = tmp_path / 'run'
-    build_bag([], [Text('a', 'old')], target, 'mcap')
+    build_bag([], [Text('a', 'old')], target)
     with pytest.raises(FileExistsError):
-        build_bag([], [Text('a', 'new')], target, 'mcap')
+        build_bag([], [Text('a', 'new')], target)
     before = (target / 'metadata.yaml').read_text()
 
     def failing():
@@ -144,11 +144,11 @@ def test_a_bag_replaces_another_one_only_if_asked(tmp_path):
         raise OSError('the disk is full')
 
     with pytest.raises(OSError, match='the disk is full'):
-        build_bag([], failing(), target, 'mcap', replace=True)
+        build_bag([], failing(), target, replace=True)
     assert (target / 'metadata.yaml').read_text() == before
-    build_bag([], [Text('a', 'new')], target, 'sqlite3', replace=True)
+    build_bag([], [Text('a', 'new')], target, replace=True)
     assert 'new' in (target / 'metadata.yaml').read_text()
-    assert sorted(one.name for one in target.iterdir()) == ['metadata.yaml', 'run.db3']
+    assert sorted(one.name for one in target.iterdir()) == ['metadata.yaml', 'run.mcap']
     assert list(tmp_path.iterdir()) == [target]
 
 
@@ -161,7 +161,7 @@ def test_a_directory_that_is_no_bag_is_never_replaced(tmp_path, content):
     (tmp_path / 'link').symlink_to(target)
     for name in ('thesis', 'link'):
         with pytest.raises(OSError, match='is not a bag: it is not replaced'):
-            open_recording('run', str(tmp_path / name), 'mcap', replace=True)
+            open_recording('run', str(tmp_path / name), replace=True)
     assert sorted(one.name for one in target.iterdir()) == sorted(content)
 
 
@@ -172,7 +172,7 @@ def test_force_replaces_bags_and_files_and_no_directories(tmp_path, robots, monk
     for name in ('run.png', 'a.png', 'a.csv'):
         (tmp_path / name).write_text('old')
     (tmp_path / 'b.png').mkdir()
-    build_bag([], [Text('a', 'old')], tmp_path / 'run', 'mcap')
+    build_bag([], [Text('a', 'old')], tmp_path / 'run')
     plot = ('plot_run', robots, '--namespace', 'one', '-o')
     for command in (
         ('drive_to', 0.2, 0, '--lockstep', '-o', 'run', '--tolerance', 0.1),
