@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import inspect
 import re
@@ -249,7 +250,9 @@ COMMON = {'-h', '--help', '--version'}
 
 def options_of(tool):
     parser = importlib.import_module(f'diffdrive_jacobian.tools.{tool}')._parser()
-    return {option for action in parser._actions for option in action.option_strings} - COMMON
+    # Those without help only refuse what other programs have.
+    shown = [action for action in parser._actions if action.help != argparse.SUPPRESS]
+    return {option for action in shown for option in action.option_strings} - COMMON
 
 
 def test_options_of_the_tools():
