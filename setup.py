@@ -42,6 +42,7 @@ setup(
     ],
     python_requires='>=3.10',
     install_requires=[
+        'mcap>=1.6',
         'numpy>=1.24',
         'rich>=12',
         'rosbags>=0.11.9,<0.12',
@@ -75,7 +76,6 @@ setup(
         'plot': ['matplotlib>=3.5'],
         'test': [
             'distributed',
-            'mcap>=1.2',
             'hypothesis>=6',
             'matplotlib>=3.5',
             'pytest>=7',

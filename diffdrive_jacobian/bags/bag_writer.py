@@ -16,9 +16,15 @@ from typing import TYPE_CHECKING, BinaryIO
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2.storage_mcap import McapWriter
 
-from diffdrive_jacobian.bags import mcap
 from diffdrive_jacobian.bags.bag_reader import BagError, DamagedBagError, messages, open_bag
-from diffdrive_jacobian.bags.files import REPLACED, is_journal, scratch_directory
+from diffdrive_jacobian.bags.corrected_reader import FOOTER
+from diffdrive_jacobian.bags.files import (
+    MCAP_MAGIC,
+    REPLACED,
+    file_checksum,
+    is_journal,
+    scratch_directory,
+)
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
 
 if TYPE_CHECKING:
@@ -48,14 +54,14 @@ class _CheckedMcapWriter(McapWriter):
     def close(self, version: int, metadata: str) -> None:
         super().close(version, metadata)
         with open(self.path, 'r+b') as file:
-            footer = file.seek(-mcap.FOOTER_END.size, 2)
-            summary, *_ = mcap.FOOTER_END.unpack(file.read())
+            footer = file.seek(-FOOTER.size - len(MCAP_MAGIC), 2)
+            summary, *_ = FOOTER.unpack(file.read(FOOTER.size))
             self._write_checksum(file, 0, summary - _DATA_END, summary - 4)
             self._write_checksum(file, summary, footer + 16, footer + 16)
 
     @staticmethod
     def _write_checksum(file: BinaryIO, start: int, end: int, place: int) -> None:
-        checksum = mcap.file_checksum(file, start, end)
+        checksum = file_checksum(file, start, end)
         file.seek(place)
         file.write(struct.pack('<I', checksum))
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import heapq
 import io
 import os
+import struct
 import sys
 from collections.abc import Collection, Generator, Iterator, Mapping
 from functools import partial
@@ -22,7 +23,7 @@ from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-from diffdrive_jacobian.bags import mcap
+from diffdrive_jacobian.bags.files import MCAP_MAGIC, file_checksum
 from diffdrive_jacobian.text import format_size
 
 if sys.version_info >= (3, 14):
@@ -30,6 +31,8 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd as zstd
 
+FOOTER = struct.Struct('<QQI')
+"""End of an MCAP file: where the summary and its offsets begin, and the checksum of the summary."""
 MAX_CHUNK = 1 << 30
 """Largest size that a chunk may claim to unpack to (bytes)."""
 UNPACK_ERRORS = (ValueError, RuntimeError, EOFError, zstd.ZstdError)
@@ -94,9 +97,9 @@ class _McapReader(McapReader):
     def _check_summary(self) -> None:
         """Raise ReaderError if the summary, which names the topics, has a checksum and is altered."""
         assert self.bio is not None
-        footer = self.bio.seek(-mcap.FOOTER_END.size, io.SEEK_END)
-        summary, _, checksum, _ = mcap.FOOTER_END.unpack(self.bio.read())
-        if checksum and mcap.file_checksum(self.bio, summary, footer + 16) != checksum:
+        footer = self.bio.seek(-FOOTER.size - len(MCAP_MAGIC), io.SEEK_END)
+        summary, _, checksum = FOOTER.unpack(self.bio.read(FOOTER.size))
+        if checksum and file_checksum(self.bio, summary, footer + 16) != checksum:
             raise ReaderError('the checksum of its summary is wrong')
 
     def messages(

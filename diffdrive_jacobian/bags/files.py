@@ -12,21 +12,25 @@ import re
 import shutil
 import stat
 import tempfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
-from diffdrive_jacobian.bags import mcap
 from diffdrive_jacobian.errors import DiffdriveError
 
 REPLACED = 'replaced'
 """Name of the bag that is replaced, while the new one takes its place."""
 JOURNAL = '.journal.mcap'
 """Ends the name of a journal, after the name of the bag."""
+MCAP_MAGIC = b'\x89MCAP0\r\n'
+"""At the beginning and at the end of an MCAP file (mcap.dev/spec)."""
 SQLITE_MAGIC = b'SQLite format 3\0'
 ZSTD = '.zstd'
+_BLOCK = 1 << 20
 _KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3'}
-_MAGICS = {mcap.MAGIC: 'mcap', SQLITE_MAGIC: 'sqlite3'}
+_MAGICS = {MCAP_MAGIC: 'mcap', SQLITE_MAGIC: 'sqlite3'}
 
 
 def scratch_prefix(target: Path) -> str:
@@ -117,6 +121,16 @@ def file_kind(path: Path) -> str:
             return kind
     name = path.with_suffix('') if path.suffix == ZSTD else path
     return _KINDS.get(name.suffix, '')
+
+
+def file_checksum(file: BinaryIO, start: int, end: int) -> int:
+    """Return the CRC-32 of a part of a file."""
+    checksum = 0
+    file.seek(min(start, end))
+    while start < end and (block := file.read(min(end - start, _BLOCK))):
+        checksum = zlib.crc32(block, checksum)
+        start += len(block)
+    return checksum
 
 
 def bag_files(path: Path) -> list[Path]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import struct
 import threading
 import zlib
 from contextlib import suppress
@@ -21,11 +20,15 @@ from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
 
+from mcap.data_stream import RecordBuilder
+from mcap.records import Attachment, Chunk, Header, McapRecord, Schema
+from mcap.records import Channel as McapChannel
+from mcap.records import Message as McapMessage
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import dump_qos_v9
 from ruamel.yaml import YAML
 
-from diffdrive_jacobian.bags import mcap
+from diffdrive_jacobian.bags.files import MCAP_MAGIC
 
 PARAMETERS = 'parameters of '
 """Followed by a node's name, the key of the custom data that holds its parameters as JSON."""
@@ -41,8 +44,6 @@ BLOCK = 8 << 20
 """Approximate size of the largest chunk (bytes). A message that is larger has a chunk of its own."""
 OVERHEAD = 250
 """Approximate memory of a record without its payload (bytes)."""
-_MESSAGE = struct.Struct('<BQHIQQ')
-_CHUNK = struct.Struct('<BQQQQIIQ')
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -84,46 +85,48 @@ class _Chunk:
     """Messages and descriptions of topics that are not written yet."""
 
     def __init__(self) -> None:
-        self.size = 0
-        self._pieces: list[bytes] = []
-        self._start, self._end = 2**64 - 1, 0
-
-    def add(self, *pieces: bytes) -> None:
-        # Kept as they are: large messages are not copied before they are written.
-        self._pieces += pieces
-        self.size += sum(map(len, pieces))
-
-    def add_stamp(self, stamp: int) -> None:
-        self._start, self._end = min(self._start, stamp), max(self._end, stamp)
+        self.records = RecordBuilder()
+        self.start, self.end = 2**64 - 1, 0
+        """Times of the first and the last message (ns)."""
 
     def pack(self) -> bytes:
         """Return the record."""
-        checksum = 0
-        for piece in self._pieces:
-            checksum = zlib.crc32(piece, checksum)
-        length = _CHUNK.size - mcap.HEAD.size + self.size
-        start = min(self._start, self._end)
-        # Not compressed: the name of the compression is empty.
-        fields = (mcap.CHUNK, length, start, self._end, self.size, checksum, 0, self.size)
-        return b''.join((_CHUNK.pack(*fields), *self._pieces))
+        data: bytes = self.records.end()
+        return packed(
+            Chunk(
+                compression='',
+                data=data,
+                message_start_time=min(self.start, self.end),
+                message_end_time=self.end,
+                uncompressed_crc=zlib.crc32(data),
+                uncompressed_size=len(data),
+            )
+        )
 
 
-def _attachment(entry: Text) -> bytes:
-    times, data = bytes(16), entry.value.encode()
-    size = mcap.number(len(data), 8)
-    content = b''.join((times, mcap.text(entry.key), mcap.text(CUSTOM_DATA), size, data))
-    return mcap.record(mcap.ATTACHMENT, content, mcap.number(zlib.crc32(content), 4))
+def packed(*records: McapRecord) -> bytes:
+    """Return records of MCAP as they are in a file."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    data: bytes = builder.end()
+    return data
 
 
 def _topic(number: int, channel: Channel) -> bytes:
     """Return the records that describe a topic and its type."""
-    index = mcap.number(number, 2)
     profiles = StringIO()
     YAML(typ='safe').dump(dump_qos_v9(list(channel.qos)), profiles)
-    texts = (channel.type_name, 'ros2msg', channel.definition)
     extra = {'offered_qos_profiles': profiles.getvalue(), 'topic_type_hash': channel.type_hash}
-    return mcap.record(mcap.SCHEMA, index, *map(mcap.text, texts)) + mcap.record(
-        mcap.CHANNEL, index, index, mcap.text(channel.topic), mcap.text('cdr'), mcap.texts(extra)
+    return packed(
+        Schema(id=number, name=channel.type_name, encoding='ros2msg', data=channel.definition.encode()),
+        McapChannel(
+            id=number,
+            schema_id=number,
+            topic=channel.topic,
+            message_encoding='cdr',
+            metadata=extra,
+        ),
     )
 
 
@@ -145,8 +148,7 @@ class JournalWriter:
             fcntl.flock(self._file, fcntl.LOCK_EX)
         self._lock = threading.Lock()
         # Records that cannot be in a chunk.
-        head = mcap.record(mcap.HEADER, mcap.text('ros2'), mcap.text(LIBRARY))
-        self._records = [mcap.MAGIC + head]
+        self._records = [MCAP_MAGIC + packed(Header(profile='ros2', library=LIBRARY))]
         self._chunks = [_Chunk()]
         self._numbers: dict[int, int] = {}
         self._topics = self._messages = 0
@@ -168,30 +170,30 @@ class JournalWriter:
         """
         with self._lock:
             if isinstance(record, Message):
-                length, stamp = mcap.MESSAGE_HEAD.size + len(record.data), record.stamp
-                channel = self._numbers[record.channel]
+                channel, data, stamp = self._numbers[record.channel], record.data, record.stamp
                 self._messages += 1
-                head = _MESSAGE.pack(mcap.MESSAGE, length, channel, self._messages, stamp, stamp)
-                chunk = self._chunk(length)
-                chunk.add(head, record.data)
-                chunk.add_stamp(stamp)
-                size = mcap.HEAD.size + length
+                chunk = self._chunk(len(data))
+                before = chunk.records.count
+                McapMessage(channel, stamp, data, stamp, self._messages).write(chunk.records)
+                chunk.start, chunk.end = min(chunk.start, stamp), max(chunk.end, stamp)
+                size = chunk.records.count - before
             elif isinstance(record, Channel):
                 # With other profiles it is another channel of MCAP, of the same topic.
                 self._topics += 1
                 self._numbers[record.id] = self._topics
                 described = _topic(self._topics, record)
                 size = len(described)
-                self._chunk(size).add(described)
+                self._chunk(size).records.write(described)
             else:
-                self._records.append(_attachment(record))
+                entry = Attachment(0, 0, record.key, CUSTOM_DATA, record.value.encode())
+                self._records.append(packed(entry))
                 size = len(self._records[-1])
             self._added += size
             self.waiting += OVERHEAD + size
 
     def _chunk(self, size: int) -> _Chunk:
         """Return the chunk of the next record, which has this size."""
-        if self._chunks[-1].size >= BLOCK or size > BLOCK:
+        if self._chunks[-1].records.count >= BLOCK or size > BLOCK:
             self._chunks.append(_Chunk())
         return self._chunks[-1]
 
@@ -210,9 +212,11 @@ class JournalWriter:
             # The memory of each is freed while the rest is being written.
             chunks.reverse()
             while chunks:
-                if (chunk := chunks.pop()).size:
-                    self._frames += _CHUNK.size
-                    self._write(chunk.pack())
+                chunk = chunks.pop()
+                if size := chunk.records.count:
+                    record = chunk.pack()
+                    self._frames += len(record) - size
+                    self._write(record)
         finally:
             with self._lock:
                 self.waiting -= waiting

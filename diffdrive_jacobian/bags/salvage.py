@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -12,8 +13,25 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from diffdrive_jacobian.bags import mcap
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    Chunk,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    Schema,
+    Statistics,
+)
+from mcap.records import Channel as McapChannel
+from mcap.records import Message as McapMessage
+
 from diffdrive_jacobian.bags.corrected_reader import UNPACK_ERRORS, unpack
+from diffdrive_jacobian.bags.files import MCAP_MAGIC, file_checksum
 from diffdrive_jacobian.bags.journal import CUSTOM_DATA, LIBRARY, Message, Text
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -40,6 +58,34 @@ Found = Topic | Message | Text | str
 
 # --- MCAP
 
+_OPCODES = frozenset(Opcode)
+_INVALID = (EndOfFile, ValueError, struct.error)
+"""What is raised for an invalid record."""
+_HEAD = struct.Struct('<BQ')
+"""Before the fields of a record: its opcode and their length."""
+_RECORDS: dict[int, Any] = {
+    Opcode.HEADER: Header,
+    Opcode.FOOTER: Footer,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: McapChannel,
+    Opcode.CHUNK: Chunk,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.STATISTICS: Statistics,
+    Opcode.METADATA: Metadata,
+    Opcode.DATA_END: DataEnd,
+}
+"""The records that are read besides messages."""
+
+
+class _Fields(ReadDataStream):
+    """The fields of a record. One that ends behind the record is an error; the library cuts it off."""
+
+    def read(self, length: int) -> bytes:
+        data = super().read(length)
+        if len(data) < length:
+            raise EndOfFile
+        return data
+
 
 class _McapFile:
     """Reads an MCAP file, and compares what is found with the checksums and counts in it."""
@@ -47,8 +93,7 @@ class _McapFile:
     def __init__(self, file: BinaryIO, note: Note, doubt: Note) -> None:
         self._file = file
         self._note, self._doubt = note, doubt
-        self._schemas: dict[int, tuple[str, str]] = {}
-        """Numbers of types to their names and definitions."""
+        self._schemas: dict[int, Schema] = {}
         self._found: Counter[int] = Counter()
         self._counts: dict[int, int] | None = None
         self._topics: dict[int, Topic] = {}
@@ -62,111 +107,106 @@ class _McapFile:
     def read(self) -> Iterator[Found]:
         size = self._file.seek(0, 2)
         self._file.seek(0)
-        if self._file.read(len(mcap.MAGIC)) != mcap.MAGIC:
+        if self._file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
             self._note(f'its {size} bytes are not the start of an MCAP file')
             return
-        good, opcode = len(mcap.MAGIC), 0
+        good, opcode = len(MCAP_MAGIC), 0
         # Where a record is invalid, the position of the next one is unknown.
-        with suppress(ValueError):
+        with suppress(*_INVALID):
             for opcode, payload, end in _walk(self._file, size):
-                if opcode == mcap.CHUNK:
+                if opcode == Opcode.CHUNK:
                     yield from self._chunk(payload, end > size)
                 elif end <= size:
-                    yield from self._record(opcode, payload, checked=False)
-                    self._check(opcode, payload, end)
+                    record = _parsed(opcode, payload)
+                    yield from self._record(record, checked=False)
+                    self._check(record, opcode, payload, end)
                 if end <= size:
                     good = end
         self._file.seek(good)
-        if good == size and opcode != mcap.FOOTER:
+        if good == size and opcode != Opcode.FOOTER:
             self._doubt('it has no end: what its writer had not written yet is not in it')
-        elif opcode != mcap.FOOTER or self._file.read(len(mcap.MAGIC) + 1) != mcap.MAGIC:
+        elif opcode != Opcode.FOOTER or self._file.read(len(MCAP_MAGIC) + 1) != MCAP_MAGIC:
             lost = f'the last {size - good} of its {size} bytes are not a complete record'
             self._note(f'it is cut off: {lost}')
         self._finish()
 
     def _chunk(self, payload: bytes, cut: bool) -> Iterator[Found]:
-        cursor = mcap.Cursor(payload)
         try:
-            start, end, size, checksum = (cursor.number(length) for length in (8, 8, 8, 4))
-            compression, length = cursor.text(), cursor.number(8)
-            data = unpack(compression, cursor.left[:length], size)
-        except UNPACK_ERRORS as error:
-            self._note(f'a chunk of {len(payload)} bytes cannot be unpacked: {error}')
+            # The library reads what there is of a chunk that is cut off.
+            chunk = Chunk.read(ReadDataStream(BytesIO(payload)))
+            data = unpack(chunk.compression, chunk.data, chunk.uncompressed_size)
+        except (*UNPACK_ERRORS, *_INVALID) as error:
+            why = str(error) or 'it is too short'
+            self._note(f'a chunk of {len(payload)} bytes cannot be unpacked: {why}')
             return
+        size, checksum = chunk.uncompressed_size, chunk.uncompressed_crc
         right = len(data) == size and checksum in (0, zlib.crc32(data))
         if not cut and not right:
-            what = f'a chunk of {size} bytes ({(end - start) / NANOSECONDS:.1f} s)'
+            seconds = (chunk.message_end_time - chunk.message_start_time) / NANOSECONDS
+            what = f'a chunk of {size} bytes ({seconds:.1f} s)'
             self._note(f'{what} is damaged: its messages may be altered')
         good = 0
-        with suppress(ValueError):
+        with suppress(*_INVALID):
             for opcode, record, ending in _walk(BytesIO(data), len(data)):
                 if ending <= len(data):
-                    yield from self._record(opcode, record, checked=checksum != 0)
+                    yield from self._record(_parsed(opcode, record), checked=checksum != 0)
                     good = ending
         if good < len(data) and not cut:
             lost = f'the last {len(data) - good} of the {size} bytes of a chunk'
             self._note(f'{lost} are not complete records')
 
-    def _record(self, opcode: int, payload: bytes, *, checked: bool) -> Iterator[Found]:
-        """Read a complete record, or raise ValueError; `checked`: in a chunk with a checksum."""
-        cursor = mcap.Cursor(payload)
-        if opcode == mcap.MESSAGE:
-            channel, number, stamp, _ = mcap.MESSAGE_HEAD.unpack(cursor.take(mcap.MESSAGE_HEAD.size))
-            self._found[channel] += 1
+    def _record(self, record: McapRecord | None, *, checked: bool) -> Iterator[Found]:
+        """Yield what is in a complete record; `checked`: it is in a chunk with a checksum."""
+        if isinstance(record, McapMessage):
+            self._found[record.channel_id] += 1
             self._behind += not self._in_data
-            self._last = max(self._last, number)
+            self._last = max(self._last, record.sequence)
             self._unchecked |= self._in_data and not checked
-            yield Message(channel, stamp, cursor.left, number)
-        elif opcode == mcap.SCHEMA:
-            number, name, _ = cursor.number(2), cursor.text(), cursor.text()
-            self._schemas[number] = name, cursor.text()
-        elif opcode == mcap.CHANNEL:
-            number, schema = cursor.number(2), cursor.number(2)
-            name, encoding, extra = cursor.text(), cursor.text(), cursor.texts()
-            type_name, definition = self._schemas.get(schema, ('', ''))
-            qos, type_hash = (extra.get(key, '') for key in ('offered_qos_profiles', 'topic_type_hash'))
-            topic = Topic(number, name, type_name, encoding, qos, type_hash, definition)
-            self._differing += self._topics.setdefault(number, topic) != topic
+            yield Message(record.channel_id, record.log_time, record.data, record.sequence)
+        elif isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, McapChannel):
+            schema = self._schemas.get(record.schema_id)
+            topic = Topic(
+                record.id,
+                record.topic,
+                schema.name if schema else '',
+                record.message_encoding,
+                record.metadata.get('offered_qos_profiles', ''),
+                record.metadata.get('topic_type_hash', ''),
+                schema.data.decode() if schema else '',
+            )
+            self._differing += self._topics.setdefault(record.id, topic) != topic
             self._unchecked |= self._in_data and not checked
             yield topic
-        elif opcode == mcap.ATTACHMENT and payload[-4:] == _checksum(payload[:-4]):
-            # Its times.
-            cursor.take(16)
-            key, media_type = cursor.text(), cursor.text()
-            if media_type == CUSTOM_DATA:
-                yield Text(key, cursor.take(cursor.number(8)).decode())
-        elif opcode == mcap.METADATA and cursor.text() == 'rosbag2':
-            yield cursor.texts().get('serialized_metadata', '')
+        elif isinstance(record, Attachment):
+            if record.media_type == CUSTOM_DATA:
+                yield Text(record.name, record.data.decode())
+        elif isinstance(record, Metadata) and record.name == 'rosbag2':
+            yield record.metadata.get('serialized_metadata', '')
 
-    def _check(self, opcode: int, payload: bytes, end: int) -> None:
-        """Take the counts and checksums from a record, or raise ValueError if it is invalid."""
-        cursor, start = mcap.Cursor(payload), end - len(payload) - mcap.HEAD.size
-        if self._numbered and self._in_data and opcode not in (mcap.ATTACHMENT, mcap.DATA_END):
+    def _check(self, record: McapRecord | None, opcode: int, payload: bytes, end: int) -> None:
+        """Take the counts and checksums from a record of the file."""
+        start = end - len(payload) - _HEAD.size
+        if self._numbered and self._in_data and opcode not in (Opcode.ATTACHMENT, Opcode.DATA_END):
             self._note(f'a record has the opcode {opcode}, which is none of a journal')
-        if opcode == mcap.STATISTICS:
-            cursor.take(42)
-            counts = mcap.Cursor(cursor.take(cursor.number(4)))
-            self._counts = {}
-            while counts:
-                channel = counts.number(2)
-                self._counts[channel] = counts.number(8)
-        elif opcode == mcap.HEADER:
-            cursor.text()
-            self._numbered |= cursor.text() == LIBRARY
-        elif opcode == mcap.ATTACHMENT:
+        if isinstance(record, Statistics):
+            self._counts = record.channel_message_counts
+        elif isinstance(record, Header):
+            self._numbered |= record.library == LIBRARY
+        elif opcode == Opcode.ATTACHMENT:
             if payload[-4:] not in (bytes(4), _checksum(payload[:-4])):
                 self._note(f'an attachment of {len(payload)} bytes is damaged: it is left out')
-        elif opcode == mcap.DATA_END:
+        elif isinstance(record, DataEnd):
             self._in_data = False
-            self._checksums['data section'] = 0, start, cursor.number(4)
-        elif opcode == mcap.FOOTER:
-            summary, _, checksum = (cursor.number(length) for length in (8, 8, 4))
-            self._checksums['summary'] = summary or start, end - 4, checksum
+            self._checksums['data section'] = 0, start, record.data_section_crc
+        elif isinstance(record, Footer):
+            self._checksums['summary'] = record.summary_start or start, end - 4, record.summary_crc
 
     def _finish(self) -> None:
         """Report what differs, and what cannot be checked."""
         for what, (start, end, checksum) in self._checksums.items():
-            right = checksum != 0 and mcap.file_checksum(self._file, start, end) == checksum
+            right = checksum != 0 and file_checksum(self._file, start, end) == checksum
             if checksum and not right:
                 self._note(f'the checksum of its {what} is wrong')
             self._data_is_right |= right and what == 'data section'
@@ -206,22 +246,39 @@ def _walk(file: BinaryIO, size: int) -> Iterator[tuple[int, bytes, int]]:
     """
     waiting: list[tuple[int, bytes, int]] = []
     end, opcode = file.tell(), 0
-    while end <= size and opcode != mcap.FOOTER and (head := file.read(mcap.HEAD.size)):
-        if head[0] not in mcap.OPCODES:
-            waiting = [] if opcode == mcap.MESSAGE else waiting
+    while end <= size and opcode != Opcode.FOOTER and (head := file.read(_HEAD.size)):
+        if head[0] not in _OPCODES:
+            waiting = [] if opcode == Opcode.MESSAGE else waiting
             break
         yield from waiting
         waiting = []
-        if len(head) < mcap.HEAD.size:
+        if len(head) < _HEAD.size:
             break
-        opcode, length = mcap.HEAD.unpack(head)
-        end += mcap.HEAD.size + length
+        opcode, length = _HEAD.unpack(head)
+        end += _HEAD.size + length
         waiting = [(opcode, file.read(min(length, size - file.tell())), end)]
     yield from waiting
 
 
+def _parsed(opcode: int, payload: bytes) -> McapRecord | None:
+    """Parse a complete record; None: it is of a kind that is not read, or an altered attachment.
+
+    Raises:
+        EndOfFile, ValueError: It is invalid.
+    """
+    fields = _Fields(BytesIO(payload))
+    record: McapRecord | None = None
+    if opcode == Opcode.MESSAGE:
+        record = McapMessage.read(fields, len(payload))
+    elif opcode == Opcode.ATTACHMENT and payload[-4:] != _checksum(payload[:-4]):
+        pass
+    elif kind := _RECORDS.get(opcode):
+        record = kind.read(fields)
+    return record
+
+
 def _checksum(content: bytes) -> bytes:
-    return mcap.number(zlib.crc32(content), 4)
+    return zlib.crc32(content).to_bytes(4, 'little')
 
 
 # --- SQLite

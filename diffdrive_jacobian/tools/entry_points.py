@@ -30,8 +30,8 @@ ROS_MODULES = (
     *('rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'unique_identifier_msgs'),
 )
 """Modules of a ROS installation, or of the extra `jazzy`."""
-ROSBAGS_MODULES = ('rosbags', 'apsw', 'backports', 'backports.zstd', 'lz4', 'ruamel', 'ruamel.yaml')
-"""Modules that come with rosbags, which a ROS installation does not bring."""
+BAG_MODULES = ('mcap', 'rosbags', 'apsw', 'backports', 'backports.zstd', 'lz4', 'ruamel', 'ruamel.yaml')
+"""Modules that come with rosbags and mcap, which a ROS installation does not bring."""
 
 
 def __getattr__(name: str) -> Callable[[], int]:
@@ -140,8 +140,8 @@ def _remedy(module: str | None) -> str | None:
             'ROS 2 Jazzy installation (. /opt/ros/jazzy/setup.bash), or call '
             "pip install '.[jazzy]' in a clone of diffdrive_jacobian"
         )
-    if module in ROSBAGS_MODULES:
-        return f'there is no Python module {module}: call pip install rosbags'
+    if module in BAG_MODULES:
+        return f'there is no Python module {module}: call pip install rosbags mcap'
     return None
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-from diffdrive_jacobian.bags.mcap import MAGIC, record, text
+from diffdrive_jacobian.bags.files import MCAP_MAGIC as MAGIC
 
 METADATA = """rosbag2_bagfile_information:
   version: 9
@@ -39,6 +39,16 @@ def write_folder(
 
 
 # --- MCAP
+
+
+def record(opcode: int, fields: bytes) -> bytes:
+    return struct.pack('<BQ', opcode, len(fields)) + fields
+
+
+def text(value: str | bytes) -> bytes:
+    """Return a field with a text."""
+    data = value.encode() if isinstance(value, str) else value
+    return struct.pack('<I', len(data)) + data
 
 
 def chunk(compression: str, packed: bytes, size: int, checksum: int = 0) -> bytes:

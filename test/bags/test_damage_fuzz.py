@@ -15,6 +15,7 @@ import zlib
 from contextlib import closing, suppress
 
 import pytest
+from mcap.opcode import Opcode
 from rclpy.serialization import serialize_message
 from rosbags.rosbag2 import CompressionMode
 from ruamel.yaml import YAML
@@ -36,8 +37,9 @@ from support.raw_bags import (
 )
 from support.ros_messages import goal, joint_command, twist
 
-from diffdrive_jacobian.bags import BagError, NotABagError, NothingToSaveError, mcap, read_run, recover
+from diffdrive_jacobian.bags import BagError, NotABagError, NothingToSaveError, read_run, recover
 from diffdrive_jacobian.bags.bag_writer import build_bag
+from diffdrive_jacobian.bags.files import MCAP_MAGIC
 from diffdrive_jacobian.bags.journal import Message, Text
 from diffdrive_jacobian.bags.recovery import Recovery, UncheckedError
 from diffdrive_jacobian.bags.run import Run
@@ -174,20 +176,20 @@ def reorder(data, at, chance):
 DAMAGE = (cut, erase, flip_bits, overwrite, write_length, duplicate, reorder)
 
 
-def left_by(data, damaged, messages):
-    """Return messages that the damage of a file leaves."""
-    if not data.startswith(mcap.MAGIC):
-        return [one for one in read_by_sqlite(damaged) if one in messages]
+def left_by(data, file, messages):
+    """Return messages that the damage of a file leaves; `data` was in it before."""
+    if not data.startswith(MCAP_MAGIC):
+        return [one for one in read_by_sqlite(file) if one in messages]
+    damaged = file.read_bytes()
     pairs = enumerate(zip(data, damaged, strict=False))
     first = next((at for at, (one, other) in pairs if one != other), min(len(data), len(damaged)))
     return [one for one in messages if data.index(one[2]) + len(one[2]) <= first]
 
 
-def read_by_sqlite(data):
+def read_by_sqlite(file):
     """Return topic, time and bytes of the messages that the library sqlite3 reads up to an error."""
     found = []
-    with closing(sqlite3.connect(':memory:')) as database, suppress(sqlite3.Error):
-        database.deserialize(bytes(data))
+    with closing(sqlite3.connect(f'file:{file}?mode=ro', uri=True)) as database, suppress(sqlite3.Error):
         topics = dict(database.execute('SELECT id, name FROM topics'))
         for topic, stamp, content in database.execute('SELECT topic_id, timestamp, data FROM messages'):
             found.append((topics.get(topic), stamp, content))
@@ -217,7 +219,7 @@ def test_damaged_bytes(whole, tmp_path):
             assert isinstance(run, BagError)
             assert is_subset(found, messages)
         if plain and not complete and not isinstance(recovery, UncheckedError):
-            assert is_subset(left_by(data, damaged, messages), found)
+            assert is_subset(left_by(data, file, messages), found)
         if complete:
             assert read_bag(given) == messages
         elif saved and not recovery.lost and not recovery.unchecked:
@@ -363,7 +365,7 @@ def test_records_of_journals_with_right_checksums(tmp_path):
             value = chance.choice((b'\0', b'\xff', b'\xed\xa0\x80', chance.randbytes(2)))
             data[place : place + len(value)] = value
         for opcode, at, to in outside:
-            if opcode == mcap.ATTACHMENT:
+            if opcode == Opcode.ATTACHMENT:
                 data[to - 4 : to] = struct.pack('<I', zlib.crc32(data[at + 9 : to - 4]))
         data[chunk + 33 : chunk + 37] = struct.pack('<I', zlib.crc32(data[inside:end]))
         path = tmp_path / f'{number}' / 'run.journal.mcap'

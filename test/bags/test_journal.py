@@ -6,11 +6,14 @@ from contextlib import closing, suppress
 from io import BytesIO
 
 import pytest
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.reader import NonSeekingReader
 from rosbags.rosbag2.metadata import parse_qos
 from support.raw_bags import LATCHED, mcap_records
 
-from diffdrive_jacobian.bags import journal, mcap
-from diffdrive_jacobian.bags.files import journal_of
+from diffdrive_jacobian.bags import journal
+from diffdrive_jacobian.bags.files import MCAP_MAGIC, journal_of
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.salvage import Topic, read_mcap
 
@@ -69,7 +72,7 @@ def test_a_cut_at_any_byte_leaves_what_precedes_it_and_any_changed_byte_is_notic
         assert left == messages[: len(left)]
         assert len(left) >= 3 * (cut >= sizes[1])
         assert lost or cut in ends
-    for place in range(len(mcap.MAGIC), len(data)):
+    for place in range(len(MCAP_MAGIC), len(data)):
         changed = bytearray(data)
         changed[place] ^= 1
         # The name or the number of a topic may be damaged, so that `read` does not know it.
@@ -95,7 +98,9 @@ def test_a_large_message_has_a_chunk_of_its_own(written, monkeypatch):
     messages = [Message(0, 1, bytes(size)) for size in (10, 2000, 10, 600, 600, 10)]
     data, _ = written(messages)
     assert read(data) == (messages, [])
-    sizes = [round(end - start, -2) for opcode, start, end in mcap_records(data) if opcode == mcap.CHUNK]
+    sizes = [
+        round(end - start, -2) for opcode, start, end in mcap_records(data) if opcode == Opcode.CHUNK
+    ]
     assert sizes[-4:] == [100, 2100, 1400, 100]
 
 
@@ -110,13 +115,10 @@ def test_profiles_that_are_offered_later_are_those_of_the_same_topic(written):
 
 
 def test_other_tools_read_it(written):
-    reader = pytest.importorskip('mcap.reader')
-    from mcap.exceptions import EndOfFile
-
     messages = [Message(number % 3, 10**18 + number, bytes([number])) for number in range(9)]
     data, _ = written(messages[:5], [Text('parameters of /robot', '{}'), *messages[5:]])
     found = []
-    read_messages = reader.NonSeekingReader(BytesIO(data), validate_crcs=True).iter_messages
+    read_messages = NonSeekingReader(BytesIO(data), validate_crcs=True).iter_messages
     # It has no end.
     with suppress(EndOfFile):
         for _, topic, message in read_messages(log_time_order=False):

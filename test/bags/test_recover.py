@@ -15,6 +15,7 @@ from pathlib import Path
 
 import lz4.frame
 import pytest
+from mcap.opcode import Opcode
 from rosbags.rosbag2 import CompressionMode
 from support.bags import REAL
 from support.raw_bags import (
@@ -38,7 +39,6 @@ from support.raw_bags import (
 from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.bags.corrected_reader import zstd
 from diffdrive_jacobian.bags.journal import Message, Text
-from diffdrive_jacobian.bags.mcap import CHUNK, DATA_END, FOOTER, METADATA, STATISTICS
 
 pytestmark = pytest.mark.usefixtures('quick_disk')
 
@@ -186,7 +186,7 @@ def test_cuts_in_a_compressed_chunk(run, tmp_path, capsys, name, compress):
     """As rosbag2 writes chunks: what comes before the cut can be unpacked, as far as whole blocks go."""
     messages = make_messages(400, 1900)
     data = write_without_metadata(run, messages=messages).read_bytes()
-    head = next(start for opcode, start, _ in mcap_records(data) if opcode == CHUNK)
+    head = next(start for opcode, start, _ in mcap_records(data) if opcode == Opcode.CHUNK)
     _, _, start, end, size, _, _, _ = struct.unpack_from('<BQQQQIIQ', data, head)
     content = data[head + 49 : head + 49 + size]
     packed = compress(content)
@@ -254,13 +254,13 @@ def test_written_checksums(ours):
     """As the specification defines them."""
     data = (ours / 'run.mcap').read_bytes()
     places = {opcode: (start, end) for opcode, start, end in mcap_records(data)}
-    chunk, _ = places[CHUNK]
+    chunk, _ = places[Opcode.CHUNK]
     size, checksum, _, length = struct.unpack_from('<QIIQ', data, chunk + 25)
     assert zlib.crc32(data[chunk + 49 : chunk + 49 + length]) == checksum
     assert size == length
-    end, after = places[DATA_END]
+    end, after = places[Opcode.DATA_END]
     assert struct.unpack_from('<I', data, after - 4) == (zlib.crc32(data[:end]),)
-    footer, _ = places[FOOTER]
+    footer, _ = places[Opcode.FOOTER]
     summary, _, checksum = struct.unpack_from('<QQI', data, footer + 9)
     assert summary == after
     assert checksum == zlib.crc32(data[summary : footer + 25])
@@ -275,10 +275,10 @@ def test_what_a_complete_bag_needs(ours, capsys):
         assert (code, out) == (1, '')
         assert f'{what} is complete: nothing to recover' in err
     assert contents(ours) == before
-    end = next(end for opcode, _, end in mcap_records(file.read_bytes()) if opcode == DATA_END)
+    end = next(end for opcode, _, end in mcap_records(file.read_bytes()) if opcode == Opcode.DATA_END)
     edit(file, lambda data: data.__setitem__(slice(end - 4, end), bytes(4)))
     assert recover(capsys, ours)[0] == 1
-    footer = struct.pack('<BQQQI', FOOTER, 20, 0, 0, 0)
+    footer = struct.pack('<BQQQI', Opcode.FOOTER, 20, 0, 0, 0)
     edit(file, lambda data: data.__setitem__(slice(end, None), footer + data[:8]))
     code, _, err = recover(capsys, ours)
     assert (code, 'it has no count of its messages' in err) == (3, True)
@@ -297,10 +297,10 @@ def test_a_bag_without_checksums_cannot_be_called_complete(run, capsys, storage)
 @pytest.mark.parametrize(
     ('opcode', 'place', 'said'),
     [
-        (STATISTICS, 9 + 46 + 2, 'its statistics count '),
-        (STATISTICS, 9 + 46 + 2, 'the checksum of its summary is wrong'),
-        (METADATA, 30, 'the checksum of its data section is wrong'),
-        (CHUNK, 200, 'a chunk of '),
+        (Opcode.STATISTICS, 9 + 46 + 2, 'its statistics count '),
+        (Opcode.STATISTICS, 9 + 46 + 2, 'the checksum of its summary is wrong'),
+        (Opcode.METADATA, 30, 'the checksum of its data section is wrong'),
+        (Opcode.CHUNK, 200, 'a chunk of '),
     ],
 )
 def test_one_byte_is_noticed(ours, capsys, opcode, place, said):

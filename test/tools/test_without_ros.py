@@ -117,7 +117,7 @@ def test_other_missing_modules(tmp_path):
     calls += [('drive_to', 1, 1), ('record_run', '-o', 'run')]
     ended = run_each(calls, ABSENT.format(modules=('rosbags',)), modules=(), cwd=tmp_path)
     for (tool, *_), one in zip(calls, ended, strict=True):
-        message = f'{tool}: error: there is no Python module rosbags: call pip install rosbags\n'
+        message = f'{tool}: error: there is no Python module rosbags: call pip install rosbags mcap\n'
         assert one == (1, '', message)
     assert not list(tmp_path.iterdir())
     with pytest.raises(AssertionError, match="ModuleNotFoundError: No module named 'numpy'"):

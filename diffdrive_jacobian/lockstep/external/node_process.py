@@ -881,7 +881,12 @@ class NodeProcess:
     def _take(self) -> list[Arrived]:
         """Return what has arrived: messages by the names of their topics, responses, requests."""
         calls, self._calls = self._calls, []
-        return [*(arrived for relay in self._relays.values() for arrived in relay.take()), *calls]
+        try:
+            return [*(arrived for relay in self._relays.values() for arrived in relay.take()), *calls]
+        except LockstepError:
+            # Datagrams that the system has counted as lost are the cause, and have another remedy.
+            self.check_lost(now=True)
+            raise
 
     @staticmethod
     def _forward(arrived: Sequence[Arrived]) -> None:
