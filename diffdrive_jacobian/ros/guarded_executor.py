@@ -120,7 +120,7 @@ class GuardedExecutor:
             self._nodes[0].get_logger().warning(
                 f'messages or requests arrive faster than they are handled, events waited '
                 f'{waited * 1e3:.0f} ms: until this program is restarted, timers and services take '
-                'turns with them, which takes two to three times the CPU time'
+                'turns with them, which takes two to six times the CPU time'
             )
             self.use_single_threaded()
         elif self._sample.done():

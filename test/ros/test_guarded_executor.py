@@ -119,7 +119,7 @@ def test_the_first_flood_moves_the_nodes_for_good_and_is_logged_with_what_it_cos
     said = capfd.readouterr().err
     assert said.count('arrive faster than they are handled') == 1
     assert 'until this program is restarted, ' in said
-    assert 'which takes two to three times the CPU time\n' in said
+    assert 'which takes two to six times the CPU time\n' in said
 
 
 def test_a_slow_callback_alone_moves_nothing(served):
