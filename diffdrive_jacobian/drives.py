@@ -129,6 +129,9 @@ class Outcome:
     across: float
     """Greatest distance of the robot from the path by the odometry (m). NaN: it was not driven along
     one."""
+    late: float
+    """How much later than by the trajectory the robot arrived (s). NaN: it did not, or there were no
+    times."""
     tolerance: float
     """Distance that counted as arrived (m). A robot that takes time to stop may have left it again."""
     offset: float
@@ -307,6 +310,7 @@ def drive(
             distance=client.distance,
             true_distance=true_distance,
             across=math.nan if client.path is None else client.path.greatest,
+            late=client.late,
             tolerance=controller.arrival.xy_tolerance,
             offset=controller.arrival.offset,
             seconds=seconds,

@@ -57,7 +57,10 @@ class Timeline:
     progress: Array
     """Arc length of the point of it that is nearest to the axle centre (m); NaN: none."""
     along: Array
-    """How far that is ahead of where a trajectory is by its times (m); NaN: no trajectory."""
+    """How far that is ahead of where a trajectory is by its times, which wait for one that is far away
+    (m); NaN: no trajectory."""
+    late: Array
+    """How long the times of a trajectory have waited so far (s); NaN: no trajectory."""
     across: Array
     """Distance from the path, positive to its left (m); NaN: none."""
     path_heading_error: Array
@@ -112,6 +115,7 @@ def timeline(run: Run) -> Timeline:
         along=errors[1],
         across=errors[2],
         path_heading_error=errors[3],
+        late=errors[4],
     )
 
 
@@ -234,9 +238,9 @@ def _progress(
 def _along_paths(
     run: Run, routes: list[Followed], driven: Indices
 ) -> tuple[tuple[Path, ...], Indices, Array]:
-    """Return the paths, which is driven along, and progress and errors, shape (4, n)."""
+    """Return the paths, which is driven along, and progress, errors and lateness, shape (5, n)."""
     paths: list[Path] = []
-    which, errors = np.full(len(driven), -1), np.full((4, len(driven)), np.nan)
+    which, errors = np.full(len(driven), -1), np.full((5, len(driven)), np.nan)
     poses, stamps = run.odometry.values[:, :3], run.odometry.stamps
     approach = run.number_of_node(
         'go_to_goal', 'path_approach_distance', GoToGoalParameters().path_approach_distance
@@ -255,22 +259,24 @@ def _along_paths(
         paths.append(path)
         s = path.project(poses[here])
         placed = Path.errors(poses[here], path.poses_at(s))
-        errors[:, here] = s, np.full(len(s), np.nan), placed.across, placed.heading
+        errors[0, here], errors[2, here], errors[3, here] = s, placed.across, placed.heading
         if path.times is not None:
             dt = np.clip(np.diff(stamps[here], prepend=stamps[here][:1]) / NANOSECONDS, 0.0, None)
-            errors[1, here] = s - _times_of_node(path, poses[here], dt, approach)
+            elapsed = _times_of_node(path, poses[here], dt, approach)
+            errors[1, here] = s - np.array([path.at_time(time).s for time in elapsed.tolist()])
+            errors[4, here] = np.cumsum(dt) - np.minimum(elapsed, path.duration)
     return tuple(paths), which, errors
 
 
 def _times_of_node(path: Path, poses: Array, dt: Array, approach: float) -> Array:
-    """Return the arc length of a trajectory at the times of go_to_goal, shape (n,) (m)."""
+    """Return the time of a trajectory as go_to_goal has it, shape (n,) (s)."""
     elapsed, result = 0.0, np.empty(len(poses))
     for index, (x, y, theta) in enumerate(poses.tolist()):
         reference = path.at_time(elapsed)
         turned = abs(wrap(reference.theta - theta)) > np.pi / 2.0
         if not turned and np.hypot(reference.x - x, reference.y - y) <= approach:
             elapsed += float(dt[index])
-        result[index] = path.at_time(elapsed).s
+        result[index] = elapsed
     return result
 
 

@@ -96,7 +96,10 @@ class PathFollower:
             return here, None
         at_end = s >= path.length - how.end_tolerance
         if self.elapsed + dt >= path.duration or (at_end and path.times is None):
-            return here if self.passing else replace(here, index=len(path.poses) - 1), None
+            if self.passing:
+                return here, None
+            elapsed = min(self.elapsed + dt, path.duration)
+            return replace(here, index=len(path.poses) - 1, elapsed=elapsed), None
         reference = here.reference(how)
         away = hypot(reference.x - x, reference.y - y)
         if away > how.approach_distance:

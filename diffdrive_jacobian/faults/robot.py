@@ -21,7 +21,7 @@ from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.numerics.checks import Finite, Positive, between, boolean, number
 from diffdrive_jacobian.numerics.fields import Name, integer, one_of
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.actuators import Actuators, time_constant
 from diffdrive_jacobian.simulation.encoders import MAX_PER_REVOLUTION
 from diffdrive_jacobian.simulation.robot import RobotModel
 from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
@@ -121,7 +121,7 @@ class ActuatorLag(RobotFault):
         seconds: Time constant (s).
     """
 
-    seconds: Positive
+    seconds: Annotated[float, time_constant]
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Set the lag of the motors."""

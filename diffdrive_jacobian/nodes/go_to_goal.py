@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -43,6 +42,7 @@ from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.graph_faults import topic_check
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
+from diffdrive_jacobian.simulation.braking import Braking
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
@@ -65,6 +65,8 @@ class Goal:
     """The path that was sent; None: waypoints."""
     path: PathFollower | None = None
     """The path that is followed; None: the waypoints are driven to one by one, or the last pose."""
+    begun: int = 0
+    """Time of the first step along the path (ns)."""
     stepped: int = 0
     """Time of the last step along the path (ns)."""
     executing: bool = False
@@ -137,6 +139,14 @@ def _waypoint(path: PathFollower) -> int:
     return max(path.index - path.passing, 0)
 
 
+def _lateness(goal: Goal, now: int) -> str:
+    """Describe how much later than by its times the end of a trajectory was reached."""
+    if goal.whole is None or goal.whole.times is None:
+        return ''
+    late = max((now - goal.begun) / NANOSECONDS - goal.whole.duration, 0.0)
+    return f', {late:.1f} s later than by its times'
+
+
 def described(goal: Goal) -> str:
     """Return a goal in words, for the log."""
     x, y, _ = goal.waypoints.poses[-1]
@@ -202,8 +212,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._odom_frame = ''
         # Twist by the odometry.
         self._twist = STANDSTILL
-        # The commands that are under way, with their times (ns).
-        self._commands: deque[tuple[int, float, float]] = deque()
+        # With stop_in_time.
+        self._braking: Braking | None = None
         # Rate of the odometry (Hz), and the times of the messages from which it is measured (ns).
         self._rate = math.inf
         self._times: list[int] = []
@@ -417,11 +427,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             command = self._step(goal, pose, now)
             if command is not None:
                 command = self._limited(*command)
-                if self.parameters.stop_in_time:
-                    path, waypoints = goal.path, goal.waypoints
-                    room = waypoints.remaining(pose, self._arrival) if path is None else path.remaining()
-                    coming = self._under_way(now)
-                    command = self._actuators.stoppable(command, room, 1.0 / self._rate, coming)
+                if self._braking is not None:
+                    command = self._braked(self._braking, goal, pose, command, now)
         except ValueError as error:
             self.log_event_warning('law', f'goal aborted: {error}')
             self._publish_command(0.0, 0.0)
@@ -429,7 +436,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             return
         if command is None:
             self._publish_command(0.0, 0.0)
-            self._end(GoalStatus.STATUS_SUCCEEDED, 'reached')
+            self._end(GoalStatus.STATUS_SUCCEEDED, f'reached{_lateness(goal, now)}')
             return
         self._publish_command(*command, now)
 
@@ -444,7 +451,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             goal.path, command = goal.path.follow(
                 pose, dt, self._path_law, self._law, self._path_settings
             )
-            goal.stepped = now
+            goal.begun, goal.stepped = goal.begun or now, now
             if command is not None:
                 return command
             self._leave_path(goal, goal.path)
@@ -473,6 +480,21 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             omega = without_whole_turns(omega, self._rate)
             v, omega = scaled_to_limits.floats(v, omega, *self._limit_values, 1.0, 1.0)
         return v, omega
+
+    def _braked(
+        self,
+        braking: Braking,
+        goal: Goal,
+        pose: tuple[float, float, float],
+        command: tuple[float, float],
+        now: int,
+    ) -> tuple[float, float]:
+        """Return a command from which the robot can stop at the last goal."""
+        if goal.path is not None:
+            room, offset = goal.path.remaining(), 0.0
+        else:
+            room, offset = goal.waypoints.remaining(pose, self._arrival), float(self._arrival.offset)
+        return braking.limited(now, self._twist, command, room, 1.0 / self._rate, offset=offset)
 
     def _begin(self, goal: Goal, pose: tuple[float, float, float]) -> bool:
         """Start executing a goal, now that the frame of the odometry and the pose are known."""
@@ -522,27 +544,12 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 'goal waits', f'the goal waits for odometry on {topic}: is the robot running?'
             )
 
-    def _under_way(self, now: int) -> tuple[float, float]:
-        """Return the distance and the turn by commands that have yet to reach the wheels."""
-        begin, end = now - self._actuators.delay, now
-        distance = turn = 0.0
-        for sent, v, omega in reversed(self._commands):
-            seconds = (end - max(sent, begin)) / NANOSECONDS
-            distance, turn, end = distance + v * seconds, turn + omega * seconds, sent
-            if sent <= begin:
-                break
-        return distance, turn
-
     def _publish_command(self, v: float, omega: float, now: int | None = None) -> None:
         """Publish a command at a time (ns); None: now."""
         now = self.now() if now is None else now
-        commands, delay = self._commands, self._actuators.delay
-        if not delay:
-            commands.clear()
-        while len(commands) > 1 and commands[1][0] <= now - delay:
-            commands.popleft()
-        commands.append((now, v, omega))
         twist = v, omega
+        if self._braking is not None:
+            self._braking.sent(now, twist)
         self._driving = twist != STANDSTILL
         data = self._serialized(twist, now)
         self._others.sent(data)
@@ -597,7 +604,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._limits = parameters.limits()
         self._limit_values = self._limits.all()
         self._arrival = parameters.arrival()
-        self._actuators = parameters.actuators()
+        self._actuators = actuators = parameters.actuators()
+        if not parameters.stop_in_time or actuators.immediate:
+            self._braking = None
+        elif self._braking is None or self._braking.actuators != actuators:
+            self._braking = Braking(actuators)
         if self._limits.max_v == 0.0:
             self.log_event_warning(
                 'max_v',

@@ -36,7 +36,7 @@ from diffdrive_jacobian.messages.goal_status import GoalFollower, GoalState
 from diffdrive_jacobian.messages.names import is_named, node_of
 from diffdrive_jacobian.ros.node import THROTTLE, explaining_failure
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
-from diffdrive_jacobian.time_units import nanoseconds
+from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
 DRIVEN_POINT_PARAMETERS = ('controller', 'offset')
 """Parameters of a controller that determine which point of the robot it drives."""
@@ -155,6 +155,8 @@ class GoalClient(Node):  # type: ignore[misc]
         self.index = 0
         """Index of the goal that is being driven to."""
         self.path: PathProgress | None = None
+        # Times of the first and the last odometry while it was driven along (ns).
+        self._begun = self._latest = 0
         """The path and the progress along it. None: goals are sent."""
         if isinstance(goals, Path):
             self.path = PathProgress(goals)
@@ -216,6 +218,17 @@ class GoalClient(Node):  # type: ignore[misc]
         """Last status of the goals."""
         sent = self._follower.newest
         return GoalState.UNKNOWN if sent is None else sent.state
+
+    @property
+    def late(self) -> float:
+        """How much later than by its times the end of a trajectory was reached (s).
+
+        NaN: it was not, or the goals have no times.
+        """
+        if self.path is None or self.path.path.times is None or self.status is not GoalState.SUCCEEDED:
+            return math.nan
+        seconds = (self._latest - self._begun) / NANOSECONDS
+        return max(seconds - self.path.path.duration, 0.0)
 
     @property
     def ended(self) -> bool:
@@ -323,6 +336,7 @@ class GoalClient(Node):  # type: ignore[misc]
             self.send()
         if self.path is not None and self.status is GoalState.EXECUTING:
             self.path.moved(state.pose)
+            self._begun, self._latest = self._begun or state.stamp, state.stamp
 
 
 def driven_offset(values: Mapping[str, Any]) -> float:

@@ -85,6 +85,9 @@ class GoalResult:
     odometry was received."""
     across: float | None = None
     """Greatest distance of the robot from the path (m). None: it was a goal, or was not driven along."""
+    late: float | None = None
+    """How much later than by the trajectory the robot arrived (s). None: it did not, or there were no
+    times."""
     reason: str = ''
     """For NOT_SENT what is missing, for SEVERAL the controllers, for LOST what happened to the
     controller; where it canceled, its answer, which may say how far the robot rolls on."""
@@ -391,6 +394,7 @@ class _Session:
             status=client.status,
             distance=self._distance() if distance is None else distance,
             across=None if math.isnan(across) else across,
+            late=None if math.isnan(client.late) else client.late,
             reason=reason,
             canceled=canceled,
         )

@@ -9,7 +9,7 @@ from typing import Any
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, parameter
-from diffdrive_jacobian.simulation.actuators import AccelerationLimits, AxisLimits
+from diffdrive_jacobian.simulation.actuators import SHORTEST, AccelerationLimits, AxisLimits
 from diffdrive_jacobian.simulation.robot_model import RobotModel
 from diffdrive_jacobian.text import printable
 
@@ -64,9 +64,17 @@ def wheel_lag_field() -> Any:
     """Declare the time constant of the wheels."""
     return parameter(
         0.0,
-        'Time constant with which the wheels follow commands, of first order [s].',
+        'Time constant with which the wheels follow commands, of first order; 0 or at least 1e-9 [s].',
         bounds=(0.0, 100.0),
     )
+
+
+def check_wheel_lag(wheel_lag: float) -> None:
+    """Raise ParameterError if the time constant is below the resolution of times, but not zero."""
+    if 0.0 < wheel_lag < SHORTEST:
+        raise ParameterError(
+            f"parameter 'wheel_lag' must be 0.0 or at least {SHORTEST:g}, got {wheel_lag!r}"
+        )
 
 
 def command_delay_field() -> Any:

@@ -32,6 +32,7 @@ from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
 from diffdrive_jacobian.parameters.common import (
     TwistParameters,
+    check_wheel_lag,
     command_delay_field,
     number_or,
     timeout_field,
@@ -254,6 +255,7 @@ class GoToGoalParameters(TwistParameters):
                 f"parameter 'offset' must be at least {MIN_OFFSET:g} m or at most {-MIN_OFFSET:g} m, "
                 f'got {self.offset:g}: the Jacobian of the axle centre itself has rank 1'
             )
+        check_wheel_lag(self.wheel_lag)
         self.chosen_controller()
         self.chosen_path_controller()
 

@@ -9,6 +9,7 @@ from typing import Any
 from diffdrive_jacobian.messages.conversion import MAX_POSITION
 from diffdrive_jacobian.parameters.common import (
     WheelParameters,
+    check_wheel_lag,
     command_delay_field,
     differ,
     timeout_field,
@@ -92,6 +93,7 @@ class VirtualRobotParameters(WheelParameters):
     def check(self) -> None:
         """Raise ParameterError if the names of the wheels or of the frames are equal."""
         WheelParameters.check(self)
+        check_wheel_lag(self.wheel_lag)
         differ('odom_frame_id', self.odom_frame_id, 'base_frame_id', self.base_frame_id)
         if self.drift() is not None:
             truth = 'ground_truth_frame_id', self.ground_truth_frame_id

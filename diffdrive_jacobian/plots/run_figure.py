@@ -64,6 +64,8 @@ FAULT_COLORS, FAULT_ALPHA = ('#E69F00', '#56B4E9', '#CC79A7', '#F0E442', '#009E7
 """Colors of the faults. Later ones share them."""
 VIOLATION = '#B00020'
 """Color of violations."""
+LATE = 0.1
+"""Lateness of a trajectory from which on it is drawn (s)."""
 NAMED, FAULT_LABEL = 6, 60
 """Number of faults that the legend names, and length beyond which a name is cut."""
 _FIXED = {
@@ -72,6 +74,7 @@ _FIXED = {
     'across': 'across path [m]',
     'along': 'along path [m]',
     'path_heading_error': 'heading to path [rad]',
+    'late': 'behind the times [s]',
     'v': r'speed $v$ [m/s]',
     'omega': r'yaw rate $\omega$ [rad/s]',
     'right': r'right wheel $\omega_R$ [rad/s]',
@@ -222,11 +225,16 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
 
 
 def _path_quantities(timelines: Sequence[Timeline]) -> tuple[str, ...]:
-    """Return the two errors that are drawn: along where there is a trajectory, else of the heading."""
+    """Return the errors that are drawn: along where there is a trajectory, else of the heading.
+
+    And how late the robot is, where the times of a trajectory waited for it.
+    """
     if not any(one.paths for one in timelines):
         return ()
-    trajectory = any(np.isfinite(one.along).any() for one in timelines)
-    return 'across', 'along' if trajectory else 'path_heading_error'
+    if not any(np.isfinite(one.along).any() for one in timelines):
+        return 'across', 'path_heading_error'
+    late = any(np.nanmax(one.late, initial=0.0) > LATE for one in timelines)
+    return ('across', 'along', 'late') if late else ('across', 'along')
 
 
 def _draw_planned_paths(plane: Axes, one: Timeline) -> None:

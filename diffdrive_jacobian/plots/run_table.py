@@ -23,6 +23,7 @@ _FIXED = (
     *('distance_m', 'bearing_error_rad', 'v_command_mps', 'omega_command_radps'),
     *('omega_right_radps', 'omega_left_radps', 'goal_heading_error_rad', 'beyond_goal_m'),
     *('path_progress_m', 'along_path_m', 'across_path_m', 'path_heading_error_rad'),
+    'late_s',
 )
 COLUMNS = (
     *_FIXED,
@@ -57,7 +58,7 @@ def table(run: Run) -> NDArray[np.float64]:
             _interpolated(one, run.wheels),
             one.goal_heading_error,
             _beyond_goal(one),
-            *(one.progress, one.along, one.across, one.path_heading_error),
+            *(one.progress, one.along, one.across, one.path_heading_error, one.late),
             *(_latest(one, getattr(run, topic.series)) for topic in SENSORS),
         ]
     )

@@ -17,11 +17,12 @@ from functools import partial
 from typing import Annotated, NamedTuple, Protocol, TypeAlias
 
 from diffdrive_jacobian.numerics.checks import (
-    NotNegative,
     NotNegativeOrInfinite,
     PositiveOrInfinite,
     nanoseconds,
+    not_negative,
     number,
+    positive,
     positive_or_infinite,
 )
 from diffdrive_jacobian.numerics.fields import Checked, instance, short
@@ -163,13 +164,29 @@ def _duration(name: str, value: object) -> int:
 Duration = Annotated[int, _duration]
 
 
+def time_constant(name: str, value: object) -> float:
+    """Require a time constant that is at least the resolution of times (s)."""
+    seconds = number(name, value, positive)
+    if seconds < SHORTEST:
+        raise ValueError(f'{name} must be at least {SHORTEST:g} s, got {seconds!r}')
+    return seconds
+
+
+def _lag(name: str, value: object) -> float:
+    """Require zero or a time constant (s)."""
+    seconds = number(name, value, not_negative)
+    if 0.0 < seconds < SHORTEST:
+        raise ValueError(f'{name} must be 0 or at least {SHORTEST:g} s, got {seconds!r}')
+    return seconds
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Actuators(Checked):
     """How a robot carries out the twists that are commanded.
 
     Raises:
-        ValueError: A value is negative or NaN, the lag is infinite, the delay is no integer, or the
-            limits are of another class.
+        ValueError: A value is negative or NaN, the lag is infinite or below `SHORTEST` but not zero, the
+            delay is no integer, or the limits are of another class.
     """
 
     max_right_speed: NotNegativeOrInfinite = math.inf
@@ -177,8 +194,8 @@ class Actuators(Checked):
     robot does not know it: unlike its velocity limits it does not keep the curvature of the path."""
     max_left_speed: NotNegativeOrInfinite = math.inf
     """Largest speed of the left wheel (rad/s)."""
-    lag: NotNegative = 0.0
-    """Time constant tau of both wheels (s)."""
+    lag: Annotated[float, _lag] = 0.0
+    """Time constant tau of both wheels (s): 0 or at least `SHORTEST`."""
     acceleration: Annotated[AccelerationLimits, partial(instance, wanted=AccelerationLimits)] = field(
         default_factory=AccelerationLimits
     )
@@ -217,33 +234,6 @@ class Actuators(Checked):
         seconds = self.reaction + self._deceleration_time(twist, wheels) / 2.0
         v, omega = twist
         return v * seconds, omega * seconds
-
-    def stoppable(
-        self, twist: Twist, room: Twist, period: float = 0.0, coming: Twist | None = None
-    ) -> Twist:
-        """Return a twist, scaled such that the robot can come to rest within a distance and a turn.
-
-        The limit of the acceleration of the wheels is left out.
-
-        Args:
-            twist: The twist.
-            room: The distance and the turn, zero or positive; infinite: any (m, rad).
-            period: Time for which the twist is held before the next one (s).
-            coming: Distance and turn by commands that are delayed; None: as if all were this twist.
-        """
-        reaction, stop = self.reaction + period, self._deceleration_time(twist, None)
-        if coming is not None:
-            reaction -= self.delay / NANOSECONDS
-            room = max(0.0, room[0] - abs(coming[0])), max(0.0, room[1] - abs(coming[1]))
-        share = 1.0
-        for speed, left in zip(map(abs, twist), room, strict=True):
-            # The largest share s <= 1 with s speed (reaction + s stop / 2) <= left.
-            if speed * (reaction + stop / 2.0) > left:
-                linear = speed * reaction
-                root = linear + math.sqrt(linear * linear + 2.0 * speed * stop * left)
-                share = min(share, 2.0 * left / root if root else 0.0)
-        v, omega = twist
-        return share * v, share * omega
 
     @property
     def reaction(self) -> float:

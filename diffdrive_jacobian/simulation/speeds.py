@@ -216,7 +216,8 @@ class Profile:
                 # The quotient rounds.
                 number += start + number * step <= begin
                 if start + (number + 0.5) * step < limit:
-                    limit = start + number * step
+                    # Long after the start a step may be shorter than the resolution of its time.
+                    limit = max(start + number * step, math.nextafter(begin, math.inf))
             limit = min(limit, end)
             yield piece.part(begin - start, limit - start), limit
             index += index + 1 < len(self.begins) and limit == self.begins[index + 1]

@@ -217,8 +217,11 @@ class PathTracking(NamedTuple):
         poses: True poses, shape (k, 3).
         references: Where the robot should have been, `path.Reference`s, shape (k, 8).
         twists: Commands, shape (k, 2) (m/s, rad/s).
-        errors: Along, across and of the heading, shape (k, 3), as `Path.errors` has them.
-        finished: Whether the end of the path was reached in time.
+        errors: Along, across and of the heading, shape (k, 3), as `Path.errors` has them, from the
+            reference, which waits for a robot that is too far from it or turned away.
+        late: How late the reference is, shape (k,) (s): the time less that of the trajectory there; NaN
+            for a path without times.
+        finished: Whether the robot came within `end_tolerance` of the end before the timeout.
     """
 
     times: Array
@@ -226,6 +229,7 @@ class PathTracking(NamedTuple):
     references: Array
     twists: Array
     errors: Array
+    late: Array
     finished: bool
 
 
@@ -278,7 +282,8 @@ def follow_path(
         pose=path.poses_at(0.0) if start is None else start,
     )
     follower = PathFollower(path)
-    samples = []
+    end = path.poses_at(path.length)
+    samples, finished = [], False
     for now in range(0, round(number('timeout', timeout, positive) * NANOSECONDS), period):
         law.now = now
         pose = robot.true_pose_tuple if localised else robot.pose_tuple
@@ -286,9 +291,16 @@ def follow_path(
             pose, (period if now else 0) / NANOSECONDS, law, law_of_goals, settings
         )
         if command is None:
-            break
-        samples.append((now / NANOSECONDS, robot.true_pose_tuple, follower.reference(settings), command))
+            # The time of a trajectory is over. Then the end is driven to as a goal.
+            finished = math.hypot(*(end[:2] - pose[:2])) <= settings.end_tolerance
+            if finished:
+                break
+            command = law_of_goals(pose, end)
+        time = now / NANOSECONDS
+        planned = math.nan if path.times is None else min(follower.elapsed, path.duration)
+        reference = follower.reference(settings)
+        samples.append((time, robot.true_pose_tuple, reference, command, time - planned))
         robot = robot.commanded(command, now).at(now + period)
-    times, poses, references, twists = (np.array(one) for one in zip(*samples, strict=True))
+    times, poses, references, twists, late = (np.array(one) for one in zip(*samples, strict=True))
     errors = np.stack(path.errors(poses, references), axis=-1)
-    return PathTracking(times, poses, references, twists, errors, command is None)
+    return PathTracking(times, poses, references, twists, errors, late, finished)

@@ -233,6 +233,8 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
             distances = f'{outcome.distance:.3f} m {side} the end of the path'
             if not math.isnan(outcome.across):
                 distances += f', after at most {outcome.across:.3f} m from it'
+            if not math.isnan(outcome.late):
+                distances += f', {outcome.late:.1f} s later than by its times'
             if not math.isnan(outcome.true_distance):
                 distances += f' by odometry, truly {outcome.true_distance:.3f} m from its end'
         did = 'still moved' if outcome.moving else 'stopped'

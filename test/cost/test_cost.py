@@ -26,7 +26,7 @@ LIMITS = {
     'batch': {'calls': 83, 'functions': 21, 'files': 6},
     # The start of a program: modules of the package, and all. A ROS installation may have fewer.
     'virtual_robot': {'own modules': 56, 'modules': 500},
-    'go_to_goal': {'own modules': 70, 'modules': 500},
+    'go_to_goal': {'own modules': 71, 'modules': 500},
     'wheel_bridge': {'own modules': 55, 'modules': 490},
 }
 BYTECODES = {

@@ -24,6 +24,7 @@ from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.plots.run_figure import figure
 from diffdrive_jacobian.plots.run_table import write_csv
+from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.drive_to import main
 
@@ -36,6 +37,36 @@ def test_a_robot_that_takes_time_stops_at_the_end():
     assert outcome.arrived
     assert not outcome.moving
     assert outcome.distance < 0.021
+
+
+def test_how_late_a_robot_is_that_is_too_slow_for_a_trajectory_is_said_everywhere(tmp_path, capfd):
+    def driven(name, path, **parameters):
+        recording = Recording(tmp_path / name, lossless=True)
+        outcome = drive(path, lockstep=True, robot_parameters=parameters, recording=recording)
+        recording.finish()
+        return outcome, timeline(read_run(tmp_path / name))
+
+    slow = {'linear.x.max_velocity': 0.2}
+    outcome, one = driven('slow', line_path(1.0).timed(0.5), **slow)
+    assert outcome.arrived
+    # 0.7 m at 0.2 m/s, and the rest as to a goal, instead of all in 2 s.
+    assert outcome.late == pytest.approx(7.4, abs=0.3)
+    assert f'goal reached, {outcome.late:.1f} s later than by its times' in capfd.readouterr().err
+    on_path = np.isfinite(one.late)
+    assert one.late[on_path][-1] == pytest.approx(outcome.late, abs=0.05)
+    assert -0.33 < np.nanmin(one.along) < -0.28
+    assert np.diff(one.late[on_path]).min() > -1e-9
+    write_csv(one.run, tmp_path / 'run.csv')
+    with open(tmp_path / 'run.csv') as file:
+        *_, row = (row for row in csv.DictReader(file) if row['late_s'])
+    assert float(row['late_s']) == pytest.approx(outcome.late, abs=0.05)
+    labels = [axes.get_ylabel() for axes in figure([one.run]).axes]
+    assert 'behind the times [s]' in labels
+    quick, one = driven('quick', line_path(0.3).timed(0.2))
+    assert 0.0 <= quick.late < 0.5
+    labels = [axes.get_ylabel() for axes in figure([one.run]).axes]
+    assert 'along path [m]' in labels
+    assert 'behind the times [s]' not in labels
 
 
 def test_a_robot_that_still_moves_is_not_said_to_have_stopped(capsys):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
+import dataclasses
 import math
+import random
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from diffdrive_jacobian.nodes.stopping import overshoot_warnings, rolls_on
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loops
 from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
+from diffdrive_jacobian.simulation.braking import Braking
 
 SLOW = {'linear.x.max_acceleration': 0.4, 'linear.x.max_deceleration': -0.1}
 ACTUATORS = Actuators(
@@ -43,16 +45,65 @@ def test_a_robot_rolls_as_far_as_predicted():
         assert ACTUATORS.rolled(command, robot.model) == pytest.approx((distance, turn), abs=1e-9)
 
 
-def test_a_stoppable_twist_needs_at_most_the_room():
-    commands = [(3.0, 0.0), (2.0, 3.0), (-2.0, 0.5), (0.01, 0.0), (0.0, 2.0)]
-    rooms = [(0.5, math.inf), (math.inf, 0.3), (0.0, math.inf), (0.5, 0.3)]
-    for command, room in itertools.product(commands, rooms):
-        v, omega = ACTUATORS.stoppable(command, room)
-        assert v * command[1] == pytest.approx(omega * command[0])
-        needed = np.abs(ACTUATORS.rolled((v, omega)))
-        assert (needed <= np.array(room) * (1.0 + 1e-9)).all(), (command, room)
-        # It is the fastest one: all of the command, or all of the room.
-        assert (v, omega) == command or np.isclose(needed, room).any(), (command, room)
+PERIOD = SECOND // 50
+
+
+@pytest.mark.parametrize('lag', [0.0, 0.1])
+@pytest.mark.parametrize('delay', [0, SECOND // 5])
+def test_a_braked_robot_comes_to_rest_within_the_room_wherever_it_is_stopped(lag, delay):
+    """Whatever it is commanded: after each command a stop one period later ends in time."""
+    chance = random.Random(f'{lag} {delay}')
+    actuators = dataclasses.replace(ACTUATORS, lag=lag, delay=delay)
+    model = RobotModel(actuators=actuators)
+    used = []
+    for _ in range(10):
+        room, turn = chance.uniform(0.0, 0.5), chance.choice((math.inf, chance.uniform(0.5, 3.0)))
+        braking, stamp = Braking(actuators), 0
+        robot = Robot(model=model, stamp=0, pose=(0.0, 0.0, 0.0))
+        command = chance.uniform(0.0, 0.5), chance.uniform(-1.0, 1.0)
+        for number in range(150):
+            if number % 25 == 0:
+                command = chance.uniform(0.0, 0.5), chance.uniform(-1.0, 1.0)
+            left = room - travelled(robot)[0], turn - abs(travelled(robot)[1])
+            v, omega = braking.limited(stamp, robot.twist, command, left, 0.02)
+            assert v * command[1] == pytest.approx(omega * command[0])
+            braking.sent(stamp, (v, omega))
+            robot = robot.commanded((v, omega), stamp)
+            stamp += PERIOD
+            robot = robot.at(stamp)
+            distance, turned = travelled(robot.commanded((0.0, 0.0), stamp).at(stamp + 20 * SECOND))
+            assert distance <= room + 1e-9
+            assert abs(turned) <= turn + 1e-9
+        used.append(max(distance / room, abs(turned) / turn))
+    # It uses the room, and does not simply creep.
+    assert np.median(used) > 0.95
+
+
+def travelled(robot):
+    """Return the distance and the turn by the wheels since the start."""
+    right, left = robot.wheel_angles
+    return 0.033 * (right + left) / 2.0, 0.033 * (right - left) / 0.16
+
+
+def test_braking_uses_the_twist_by_the_odometry_and_the_point_that_is_driven():
+    """Straight on, without delay and lag: v <= sqrt(2 a D)."""
+    limits = AccelerationLimits(v=AxisLimits(max_deceleration=-0.1))
+    braking = Braking(Actuators(acceleration=limits))
+    v, omega = braking.limited(0, (0.0, 0.0), (1.0, 0.0), (0.2, math.inf), 0.0)
+    assert (v, omega) == (pytest.approx(math.sqrt(2.0 * 0.1 * 0.2), abs=1e-3), 0.0)
+    # It is faster than what was commanded, and decelerates.
+    assert braking.limited(SECOND, (0.3, 0.0), (0.1, 0.0), (0.2, math.inf), 0.0) == (0.0, 0.0)
+    # The yaw rate decelerates at once, but a point off the axle moves with it.
+    turning = Actuators(acceleration=AccelerationLimits(omega=AxisLimits(max_deceleration=-0.5)))
+    v, omega = Braking(turning).limited(0, (0.0, 0.0), (0.0, 2.0), (0.1, math.inf), 0.0, offset=0.1)
+    assert (v, omega) == (0.0, pytest.approx(1.0, abs=1e-3))
+
+
+def test_braking_starts_anew_when_the_clock_is_set_back():
+    braking = Braking(dataclasses.replace(ACTUATORS, lag=0.0))
+    for stamp in (100 * SECOND, SECOND):
+        assert braking.limited(stamp, (0.3, 0.0), (0.3, 0.0), (2.0, math.inf), 0.02) == (0.3, 0.0)
+        braking.sent(stamp, (0.3, 0.0))
 
 
 def test_the_description_is_empty_where_nothing_is_to_be_said():
