@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from diffdrive_jacobian.control.path import CORNER, Path
+from diffdrive_jacobian.control.path_source import figure_eight_path
 from diffdrive_jacobian.kinematics import se2
 
 
@@ -68,6 +69,46 @@ def test_the_path_goes_through_the_poses_with_one_tangent():
     share = np.clip(((between[:, None] - positions[:-1]) * chord).sum(-1) / (chord**2).sum(-1), 0.0, 1.0)
     off = np.linalg.norm(between[:, None] - positions[:-1] - share[..., None] * chord, axis=-1).min(-1)
     assert 0.01 < off.max() < 0.5 * math.tan(CORNER / 2) * np.linalg.norm(chord, axis=-1).max()
+
+
+def curve(rng, ratio):
+    """Unevenly spaced positions on a curve, their arc lengths, and its curvature `sin(2 s)`."""
+    s = np.concatenate([[0.0], np.cumsum(0.1 * rng.uniform(1.0, ratio, 60))])
+    fine = np.linspace(0.0, s[-1], 100_001)
+    # The integral of the curvature, and that of its direction by the trapezoidal rule.
+    directions = np.array([np.cos(np.sin(fine) ** 2), np.sin(np.sin(fine) ** 2)])
+    steps = np.diff(fine) * (directions[:, 1:] + directions[:, :-1]) / 2.0
+    places = np.concatenate([np.zeros((2, 1)), np.cumsum(steps, axis=1)], axis=1)
+    return np.column_stack([np.interp(s, fine, one) for one in places]), s
+
+
+@pytest.mark.parametrize(('ratio', 'most'), [(1.0, 0.09), (2.0, 0.16), (3.0, 0.23)])
+def test_the_curvature_follows_that_of_a_curve_and_does_not_zigzag(ratio, most):
+    positions, s = curve(np.random.default_rng(5), ratio)
+    path = Path(positions)
+    inside = np.linspace(0.5, path.length - 0.5, 2000)
+    curvature = np.array([path.at(one, 1.0).omega for one in inside])
+    # Each arc has one curvature: a step between two that the curve has over its length.
+    assert abs(curvature - np.sin(2.0 * inside)).max() < most
+    jumps = np.diff(curvature)
+    against = jumps * np.cos(2.0 * inside[1:]) < 0.0
+    assert abs(jumps[against]).sum() < 0.02 * abs(jumps).sum()
+    assert path.arc_lengths == pytest.approx(s, rel=1e-4)
+
+
+def test_the_figure_eight_is_the_lemniscate():
+    path = figure_eight_path(1.0)
+    u = np.linspace(0.0, 2.0 * math.pi, 100_001)
+    speed = 1.0 / np.sqrt(1.0 + np.sin(u) ** 2)
+    s = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2.0 * np.diff(u))])
+    assert path.length == pytest.approx(s[-1], rel=1e-6)
+    for place in np.linspace(0.0, path.length, 500, endpoint=False):
+        at = np.interp(place * s[-1] / path.length, s, u)
+        here, c = path.at(place, 1.0), 1.0 / (1.0 + math.sin(at) ** 2)
+        assert here[:2] == pytest.approx(
+            (c * math.sin(at) * math.cos(at), 1.0 - c * math.cos(at)), abs=2e-6
+        )
+        assert here.omega == pytest.approx(3.0 * math.cos(at) * math.sqrt(c), abs=0.04)
 
 
 def test_a_corner_stays_a_corner_and_a_line_a_line():
