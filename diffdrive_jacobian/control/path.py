@@ -3,7 +3,7 @@
 Model: the positions are connected by circular arcs, two for each pair (a biarc), which meet with the
 same tangent. The tangent at a position is that of the circle through it and its neighbours, corrected by
 the change of the curvature, so the positions of a circle give that circle. The arcs are what a unicycle
-drives at constant speeds: the path at arc length s is `exp` of SE(2), exact, with the curvature omega / v.
+drives at constant speeds: the path at arc length s is `exp` of SE(2), exact, of curvature omega / v.
 
 - Headings of the poses are not used, because planners often leave them at 0. A robot drives along the
   path forwards.

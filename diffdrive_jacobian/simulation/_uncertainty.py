@@ -86,7 +86,7 @@ def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> 
     displacement = first = of_psi = 0j
     for node, weight in nodes:
         v, omega, path, turn = piece.state(node * T)
-        m = (p * path + q * turn) / (2.0 * L * L)
+        m = max(p * path + q * turn, 0.0) / (2.0 * L * L)
         vw = (r * v + s * omega) / (2.0 * L)
         half, loss = 0.5j * vw, expm1(-m)
         z, decay = complex(cos(turn), sin(turn)), 1.0 + loss
@@ -98,7 +98,9 @@ def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> 
         displacement += weight * v * z
         first += weight * inner
         of_psi += weight * (z * decay * ((v + half) * 2j * m + vw))
-        at.append((weight, z, v, v + half, (p * v + q * omega) / 4.0, m, decay))
+        # Near a standstill a wheel may turn the other way by rounding.
+        vv = max(p * v + q * omega, 0.0) / 4.0
+        at.append((weight, z, v, v + half, vv, m, decay))
     xx = xy = yy = 0.0
     square = product = 0j
     for row, (weight, z, v, drift, vv, m, decay), a, b in zip(
@@ -116,12 +118,13 @@ def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> 
         xy += weight * (with_gamma.imag + vv * (1.0 + lost) * double.imag / 2.0)
         square, product = square + weight * a, product + weight * b
     _, _, path, turn = piece.state(T)
-    m = (p * path + q * turn) / (2.0 * L * L)
+    m = max(p * path + q * turn, 0.0) / (2.0 * L * L)
     first, of_psi, decay = first * T, of_psi * T, exp(-m)
     # E[gamma (exp(i psi) - 1)] and E[gamma* (exp(i psi) - 1)] at the end.
     a, b = decay * square * T - first, decay * product * T - first.conjugate()
     noise = NoiseMoments(
-        *(first.real, first.imag, xx * T, xy * T, yy * T, of_psi.real, of_psi.imag),
+        *(first.real, first.imag, max(xx, 0.0) * T, xy * T, max(yy, 0.0) * T),
+        *(of_psi.real, of_psi.imag),
         *((a.real + b.real) / 2.0, (a.imag + b.imag) / 2.0),
         *((a.imag - b.imag) / 2.0, (b.real - a.real) / 2.0),
     )

@@ -61,7 +61,8 @@ _QUADRATURES = (0.05, Quadrature.of(3)), (0.25, Quadrature.of(4)), (math.inf, Qu
 def speed_at(course: Course, t: float, tau: float) -> float:
     """Return a speed after the time t."""
     a, b, c = course
-    return a + b * t + (c * exp(-t / tau) if c else 0.0)
+    # At the beginning it is the given speed, without rounding, also where that is zero.
+    return (a + c) + (b * t + c * expm1(-t / tau)) if c else a + b * t
 
 
 def travelled(course: Course, t: float, tau: float) -> float:
@@ -134,12 +135,13 @@ class Piece(NamedTuple):
     def state(self, t: float) -> tuple[float, float, float, float]:
         """Return the twist after the time t, and the path and the turn until then."""
         (a, b, c), (d, e, f), tau = self.v, self.omega, self.tau
-        v, omega, path, turn = a + b * t, d + e * t, (a + b * t / 2.0) * t, (d + e * t / 2.0) * t
+        path, turn = (a + b * t / 2.0) * t, (d + e * t / 2.0) * t
         if c or f:
             loss = expm1(-t / tau)
-            v, omega = v + c * (1.0 + loss), omega + f * (1.0 + loss)
+            v, omega = (a + c) + (b * t + c * loss), (d + f) + (e * t + f * loss)
             path, turn = path - c * tau * loss, turn - f * tau * loss
-        return v, omega, path, turn
+            return v, omega, path, turn
+        return a + b * t, d + e * t, path, turn
 
     def quadrature(self, t: float) -> Quadrature:
         """Return the quadrature that is exact to 1e-14 over the time t, at most a step."""

@@ -214,6 +214,18 @@ def test_the_moments_are_those_of_many_short_arcs():
     close((found - fine - (fine - coarse) / 3.0) / scale, 0.0, 5e-5)
 
 
+@pytest.mark.parametrize('lag', [0.1, 0.3])
+@pytest.mark.parametrize('acceleration', [0.3, 1.0])
+def test_at_the_very_beginning_no_variance_is_negative_and_no_speed_goes_back(acceleration, lag):
+    axis = AxisLimits(max_acceleration=acceleration)
+    limited = AccelerationLimits(v=axis, omega=axis)
+    robot = at_rest(lag=lag, delay=SECOND // 10, acceleration=limited).commanded((0.2, 0.7), 0)
+    for after in range(20):
+        here = robot.at(SECOND // 10 + after)
+        assert np.diag(here.covariance).min() >= 0.0
+        assert min(here.twist) >= 0.0
+
+
 def test_the_moments_of_a_part_and_the_rest_are_those_of_the_whole():
     robot = at_rest(acceleration=limits(), lag=0.1, wheel_travel_variance=1e-3)
     robot = robot.commanded((0.4, 1.5), 0)
