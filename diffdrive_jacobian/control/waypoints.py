@@ -201,17 +201,29 @@ class Waypoints:
         return here, turn_in_place(theta, heading, turning_gain)
 
     def remaining(self, pose: Pose, arrival: Arrival) -> tuple[float, float]:
-        """Return the distance and the turn that are left.
+        """Return how far a robot may still roll and turn, so that it can stop at the last goal (m, rad).
 
-        The distance to the last position by way of the waypoints (m) is infinite while the robot turns
-        in place; what is left of that turn (rad) is infinite before it.
+        It may roll to that goal by way of the waypoints, but not out of the tolerance again where it
+        heads past the goal. While it turns in place it may turn to the heading, and what is left of the
+        tolerance limits how far it rolls, at least a tenth of it. The turn is infinite before.
         """
         x, y, theta = pose
+        tolerance, goal = arrival.xy_tolerance, self._goal
+        distance = float(distance_to_goal.formula(x, y, theta, *goal[:2], arrival.offset))
         if self.turning:
-            return math.inf, abs(heading_error.formula(theta, self._goal[2]))
-        legs = np.hypot(*np.diff(self.poses[self.index :, :2], axis=0).T)
-        first = distance_to_goal.formula(x, y, theta, *self._goal[:2], arrival.offset)
-        return float(first + legs.sum()), math.inf
+            turn = abs(float(heading_error.formula(theta, goal[2])))
+            return max(tolerance - distance, tolerance / 10.0), turn
+        if self.index + 1 < len(self.poses):
+            legs = np.hypot(*np.diff(self.poses[self.index :, :2], axis=0).T)
+            return distance + float(legs.sum()), math.inf
+        # Of the line ahead: where it leaves the circle of the tolerance, if it meets it.
+        cosine, sine = math.cos(theta), math.sin(theta)
+        dx, dy = goal[0] - x, goal[1] - y
+        ahead, beside = cosine * dx + sine * dy - arrival.offset, cosine * dy - sine * dx
+        leaves = ahead + math.sqrt(max(tolerance**2 - beside**2, 0.0))
+        if abs(beside) > tolerance or leaves < 0.0:
+            leaves = 0.0
+        return max(distance - tolerance, min(distance, leaves)), math.inf
 
     def resumed(self) -> Waypoints:
         """Return the waypoints with the last position to be checked again.

@@ -50,6 +50,7 @@ multibody mechanisms", 1977.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -324,9 +325,10 @@ def manipulability(J: Any) -> Array:
     more rows than columns, because some velocities cannot be produced then.
     """
     if len(J) == 2:
-        # Cauchy and Binet: det(J J^T) is the sum of the squared minors.
+        # Cauchy and Binet: det(J J^T) is the sum of the squared minors. `hypot` squares none that
+        # overflows or vanishes.
         minors = [a * d - b * c for (a, c), (b, d) in combinations(zip(*J, strict=True), 2)]
-        return np.asarray(np.sqrt(sum(minor * minor for minor in minors)))
+        return np.asarray(reduce(np.hypot, minors, 0.0))
     # And the product of the squared singular values.
     s = np.linalg.svd(np.moveaxis(J, (0, 1), (-2, -1)), compute_uv=False)
     return np.asarray(s.prod(axis=-1) * (len(J) <= len(J[0])))

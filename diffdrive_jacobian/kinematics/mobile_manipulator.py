@@ -31,14 +31,14 @@ from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, f
 __all__ = ['MobileManipulator', 'mobile_manipulator_jacobian']
 
 
-@formula('(),(n),(n),(2),(),() -> (3,k)')
+@formula('(n),(),(n),(2),(),() -> (3,k)')
 def mobile_manipulator_jacobian(
-    theta: Number, q: Vector, lengths: Vector, mount: Vector, r: Number, L: Number
+    lengths: Vector, theta: Number, q: Vector, mount: Vector, r: Number, L: Number
 ) -> Rows:
     """Return the Jacobian of `MobileManipulator` with the heading, over wheels and joints.
 
-    For headings theta of the base, shape (...) (rad), joint angles q, shape (..., n) (rad), lengths of
-    the links, shape (n,) (m), the position of the arm's base in the frame of the axle centre, shape (2,)
+    For lengths of the links, shape (n,) (m), headings theta of the base, shape (...) (rad), joint angles
+    q, shape (..., n) (rad), the position of the arm's base in the frame of the axle centre, shape (2,)
     (m), and wheel radius r and separation L (m), it has the shape (..., 3, 2 + n).
     """
     R = [
@@ -101,7 +101,7 @@ class MobileManipulator(Checked):
         """
         q = self._checked(q)
         J = mobile_manipulator_jacobian(
-            q[..., 2], q[..., 3:], self.arm.lengths, self.mount, self.r, self.L
+            self.arm.lengths, q[..., 2], q[..., 3:], self.mount, self.r, self.L
         )
         return J if heading else J[..., :2, :]
 

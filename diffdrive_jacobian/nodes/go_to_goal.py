@@ -490,10 +490,14 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         now: int,
     ) -> tuple[float, float]:
         """Return a command from which the robot can stop at the last goal."""
+        offset = 0.0
         if goal.path is not None:
-            room, offset = goal.path.remaining(), 0.0
+            room = goal.path.remaining()
         else:
-            room, offset = goal.waypoints.remaining(pose, self._arrival), float(self._arrival.offset)
+            room = goal.waypoints.remaining(pose, self._arrival)
+            if not goal.waypoints.turning:
+                # A turn in place moves the driven point in any case.
+                offset = float(self._arrival.offset)
         return braking.limited(now, self._twist, command, room, 1.0 / self._rate, offset=offset)
 
     def _begin(self, goal: Goal, pose: tuple[float, float, float]) -> bool:

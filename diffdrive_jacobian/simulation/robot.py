@@ -6,7 +6,8 @@ timestamps. Times are integer nanoseconds, so that Unix time loses no precision.
 
 The state is stored at the last event (command, timeout, placement). Every later state is computed from
 it along one exact arc, or with `actuators` that take time along the `Drive` that began with that event.
-So the motion does not depend, to the last bit, on when states are computed. The pose is that of the
+So the states of one robot do not depend, to the last bit, on which of them were computed. A robot that
+`at` returns begins its arc at that time, and rounds otherwise. The pose is that of the
 odometry. With a `drift` in its model the robot is truly elsewhere, at `true_pose`.
 
 Source: doc/mathematics.md, "Motion".

@@ -1,7 +1,7 @@
 """What one message costs, in counts: a loss of speed that no test of time would notice fails here.
 
-Who raises a limit says why in the commit. Limits are those of today, with 1 % for bytecodes, and 3 % on the
-executor, where a busy machine adds up to 1.5 %.
+Who raises a limit says why in the commit. Limits are those of today, with 1 % for bytecodes, and 3 % on
+the executor, where a busy machine adds up to 1.5 %.
 """
 
 from __future__ import annotations

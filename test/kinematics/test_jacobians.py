@@ -136,7 +136,7 @@ def of_mobile_manipulators(rng):
             robot.configuration_jacobian(q),
             differences(moved, still),
         )
-        jacobian = mobile_manipulator_jacobian(q[:, 2], q[:, 3:], arm.lengths, mount, 0.05, 0.3)
+        jacobian = mobile_manipulator_jacobian(arm.lengths, q[:, 2], q[:, 3:], mount, 0.05, 0.3)
         yield 'mobile_manipulator.mobile_manipulator_jacobian', jacobian, numeric
 
 

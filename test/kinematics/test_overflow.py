@@ -147,6 +147,8 @@ def test_velocities_that_overflow_raise_an_error():
         (np.diag([1e200, 1e200, 1e-200]), 1e200),
         (np.diag([1e-100, 1e100, 1e100, 1e-100]), 1.0),
         (np.diag([1e150, 1e-150]), 1.0),
+        (1e-90 * np.eye(2, 3), 1e-180),
+        (1e80 * np.eye(2, 3), 1e160),
         (np.diag([1e-200, 1e-200, 1e-200]), 0.0),
         (1e100 * J3, 3e300),
         (np.diag([1e120, 1e120, 1e120]), np.inf),
