@@ -1,5 +1,8 @@
 """Driving by hand, with a dead-man's switch: a page that stops asking stops the robot.
 
+A page that was silent, because its machine froze for example, still holds the key when it is back. It
+must release it before it drives again.
+
 The page is watched by a monotonic clock; commands are spaced by the robot's, which may be simulated. An
 active goal is canceled first, and driving begins when that is confirmed.
 """
@@ -27,6 +30,8 @@ class Act(Enum):
     PUBLISH = auto()
     STOP = auto()
     """Publish a zero: driving has ended."""
+    EXPIRE = auto()
+    """Publish a zero: the page was silent, and must release the keys before it drives again."""
     GIVE_UP = auto()
     """Report that the goal was not canceled; nothing was driven."""
 
@@ -43,11 +48,15 @@ class HandDriving:
         self._commanded, self._published = -1.0, -math.inf
         self._canceling: float | None = None
         self._moved = self._released = False
+        self._silent: set[int] = set()
+        """Pages that were silent while they drove, and have not released the keys since."""
 
     def command(self, page: int, twist: tuple[float, float], now: float) -> bool:
         """Take a command of a page. Return False if another page drives."""
         if self.page not in (None, page):
             return False
+        if page in self._silent:
+            return True
         if self.page is None:
             self._canceling, self._moved, self._published = None, False, -math.inf
         self.page, self.twist, self._commanded, self._released = page, twist, now, False
@@ -55,6 +64,7 @@ class HandDriving:
 
     def release(self, page: int) -> None:
         """Take the end of driving by a page."""
+        self._silent.discard(page)
         if self.page == page:
             self._released = True
 
@@ -67,9 +77,13 @@ class HandDriving:
         """
         if self.page is None:
             return Act.NOTHING
-        if self._released or now - self._commanded > DEAD_MAN or not is_open(self.page):
+        if self._released or not is_open(self.page):
             self.page = None
             return Act.STOP if self._moved else Act.NOTHING
+        if now - self._commanded > DEAD_MAN:
+            self._silent.add(self.page)
+            self.page = None
+            return Act.EXPIRE
         if goal_active:
             if self._canceling is None:
                 self._canceling = now

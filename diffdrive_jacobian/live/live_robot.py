@@ -30,7 +30,7 @@ from diffdrive_jacobian.live.commands import (
     SendGoal,
     SetParameter,
 )
-from diffdrive_jacobian.live.hand import STANDSTILL, Act, HandDriving
+from diffdrive_jacobian.live.hand import DEAD_MAN, STANDSTILL, Act, HandDriving
 from diffdrive_jacobian.live.robot_state import GoalEnd, RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
 from diffdrive_jacobian.live.session import Session
@@ -330,9 +330,15 @@ class LiveRobot:
         act = self.hand.update(*clocks, self._session.is_open, self.state.goal.active)
         if act is Act.PUBLISH:
             self.topics.publish_twist(self.hand.twist, self._now())
-        elif act is Act.STOP:
+        elif act in (Act.STOP, Act.EXPIRE):
             self.topics.publish_twist(STANDSTILL, self._now())
-            if rolling := self._rolls_on():
+            rolling = self._rolls_on()
+            if act is Act.EXPIRE:
+                self._warn(
+                    f'the page was silent for {DEAD_MAN:g} s, driving by hand has ended: release the '
+                    f'keys before you drive again{rolling}'
+                )
+            elif rolling:
                 self._session.notify(f'driving by hand has ended, zero was sent{rolling}')
         elif act is Act.CANCEL_GOAL:
             self._session.notify('driving by hand: the goal is canceled')

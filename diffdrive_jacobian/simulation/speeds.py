@@ -221,7 +221,8 @@ class Profile:
                     # Long after the start a step may be shorter than the resolution of its time.
                     limit = max(start + number * step, math.nextafter(begin, math.inf))
             limit = min(limit, end)
-            yield piece.part(begin - start, limit - start), limit
+            if limit > begin:
+                yield piece.part(begin - start, limit - start), limit
             index += index + 1 < len(self.begins) and limit == self.begins[index + 1]
             begin = limit
 

@@ -131,6 +131,24 @@ def test_a_key_drives_and_letting_go_stops(live):
     assert along == pytest.approx(math.dist(moved[:2], (x, y)), abs=2e-3)
 
 
+def test_a_frozen_page_drives_again_only_after_the_key_was_released(live):
+    browser = live.browser
+    browser.key('Down', 'KeyW')
+    live.state('by hand')
+    browser.freeze(1.0)
+    # It is back, the key is still held, and the page goes on asking.
+    browser.until('document.getElementById("notices").innerText.includes("release the keys")')
+    live.settled()
+    place = live.pose()
+    time.sleep(0.5)
+    assert live.pose() == place
+    browser.key('Up', 'KeyW')
+    browser.key('Down', 'KeyW')
+    live.state('by hand')
+    browser.key('Up', 'KeyW')
+    live.settled()
+
+
 @pytest.mark.parametrize('event', ['blur', 'hidden'])
 def test_a_page_without_attention_stops_the_robot(live, event):
     browser = live.browser

@@ -103,12 +103,26 @@ def test_driving_ends_when_the_page_is_silent_or_closed(hand):
     assert ask(hand, 10.0) is Act.PUBLISH
     assert ask(hand, 10.01) is Act.NOTHING
     assert ask(hand, 10.0 + 0.9 * DEAD_MAN) is Act.PUBLISH
-    assert ask(hand, 10.0 + 1.1 * DEAD_MAN) is Act.STOP
+    assert ask(hand, 10.0 + 1.1 * DEAD_MAN) is Act.EXPIRE
     assert hand.page is None
     assert ask(hand, 11.0) is Act.NOTHING
-    assert hand.command(1, (0.2, 0.0), now=11.0)
+    assert hand.command(2, (0.2, 0.0), now=11.0)
     assert ask(hand, 11.0) is Act.PUBLISH
     assert ask(hand, 11.01, is_open=False) is Act.STOP
+
+
+def test_a_page_that_was_silent_must_release_the_keys_before_it_drives_again(hand):
+    """It was frozen with a key held, and goes on asking as soon as it is back."""
+    assert ask(hand, 10.0) is Act.PUBLISH
+    assert ask(hand, 11.0) is Act.EXPIRE
+    for tenth in range(20):
+        assert hand.command(1, (0.2, 0.0), now=11.0 + tenth / 10)
+        assert ask(hand, 11.0 + tenth / 10) is Act.NOTHING
+    hand.release(1)
+    assert ask(hand, 13.0) is Act.NOTHING
+    assert hand.command(1, (0.1, 0.0), now=13.0)
+    assert ask(hand, 13.0) is Act.PUBLISH
+    assert hand.twist == (0.1, 0.0)
 
 
 def test_commands_are_spaced_by_the_clock_of_the_robot(hand):

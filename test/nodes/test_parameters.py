@@ -13,7 +13,7 @@ import yaml
 from rcl_interfaces.msg import ParameterType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from support.lockstep_nodes import LEAN, change
+from support.lockstep_nodes import LEAN, change, make
 
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -312,3 +312,16 @@ def test_a_parameter_for_all_nodes_need_not_be_of_each(written, capfd):
         node.destroy_node()
     reported = re.findall("unknown parameter '([^']*)'", capfd.readouterr().err)
     assert reported == ['colour', 'kpp', 'shape']
+
+
+@pytest.mark.parametrize('kind', [GoToGoal, VirtualRobot])
+def test_a_lag_that_is_below_the_resolution_of_times_is_refused_while_a_node_runs(lockstep, kind):
+    node = lockstep.add(make(kind, command_delay=0.001))
+    lockstep.run_for(0.1)
+    # As which an integer 1 in the bytes of a double arrives.
+    for lag in (5e-324, 1e-20, 2e-18):
+        result = change(node, wheel_lag=lag)
+        assert not result.successful
+        assert result.reason == f"parameter 'wheel_lag' must be 0.0 or at least 1e-09, got {lag}"
+    assert change(node, wheel_lag=1e-9).successful
+    lockstep.run_for(0.1)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
 
 from diffdrive_jacobian.control import VelocityLimits
+from diffdrive_jacobian.faults.robot import ActuatorLag
 from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 from diffdrive_jacobian.simulation.slip import Drift
+from diffdrive_jacobian.simulation.speeds import Piece, Profile
 
 SECOND = 1_000_000_000
 L = 0.16
@@ -280,3 +282,23 @@ def test_limits_with_the_wrong_sign_are_refused():
     ):
         with pytest.raises(ValueError, match=name):
             AxisLimits(**{name: value})
+
+
+def test_a_lag_below_the_resolution_of_times_is_refused():
+    """As small as it was, the steps of the motion did not progress."""
+    for lag in (5e-324, 1e-20, 9e-10):
+        with pytest.raises(ValueError, match=f'lag must be 0 or at least 1e-09 s, got {lag}'):
+            Actuators(lag=lag)
+        with pytest.raises(ValueError, match=f'seconds must be at least 1e-09 s, got {lag}'):
+            ActuatorLag(lag)
+    close(at_rest(lag=1e-9).commanded((0.2, 0.7), 0).at(SECOND).twist, (0.2, 0.7))
+
+
+def test_steps_progress_also_where_they_are_shorter_than_the_resolution_of_times():
+    """After a ramp of 30 years that is 1e-7 s."""
+    ramp = Piece(1e9, (0.0, 1e-9, 0.0), (0.0, 0.0, 0.0))
+    lagging = Piece(36e-8, (1.0, 0.0, -1.0), (0.0, 0.0, 0.0), 1e-8)
+    profile = Profile(0, [ramp, lagging, Piece(math.inf, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))])
+    ends = [end for _, end in islice(profile.steps(1e9 - 1.0, 1e9 + 1.0), 1000)]
+    assert ends[-1] == 1e9 + 1.0
+    assert all(first < second for first, second in pairwise(ends))
