@@ -112,7 +112,7 @@ class Finding:
         event = 'violated' if self.violation.index >= 0 else 'failed'
         lines = [
             printable(self.violation.key, LONGEST_KEY),
-            f'  {self.count} worlds, the first is number {self.first_world}; '
+            f'  {self.count} world{"s" * (self.count != 1)}, the first is number {self.first_world}; '
             f'smallest case after {self.shrink_worlds} worlds'
             + ('' if self.complete else ' (not shrunk to the end)'),
             f'  {event} at {self.violation.seconds:g} s: {self.violation.headline}',

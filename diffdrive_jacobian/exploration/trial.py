@@ -6,7 +6,7 @@ import hashlib
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -277,9 +277,10 @@ class MessageDigest:
     order in which they appear.
     """
 
-    def __init__(self, world: Lockstep) -> None:
-        """Start without messages."""
+    def __init__(self, world: Lockstep, without: Collection[str] = ()) -> None:
+        """Start without messages. Those on the topics `without` do not count."""
         self._world = world
+        self._without = {*NOT_OF_ROBOTS, *without}
         self._hash = hashlib.sha256()
         self._identifiers: dict[bytes, int] = {}
 
@@ -289,7 +290,7 @@ class MessageDigest:
         def hashing(publish: Callable[..., None]) -> Callable[..., None]:
             def hashed(publisher: Publisher, msg: Any) -> None:
                 publish(publisher, msg)
-                if publisher.topic_name not in NOT_OF_ROBOTS:
+                if publisher.topic_name not in self._without:
                     self._add(publisher, msg)
 
             return hashed
@@ -320,8 +321,9 @@ class MessageDigest:
                 identifier = bytes(value.uuid)
                 number = self._identifiers.setdefault(identifier, len(self._identifiers))
                 return [str(number) if any(identifier) else 'none']
-            case Array() if hasattr(value, 'tobytes'):
-                return [value.tobytes().hex()]
+            case Array() | Sequence() if hasattr(value, 'tobytes'):
+                # Numbers, as rclpy has them: a megabyte of an image at once.
+                return [str(len(value)), hashlib.sha256(value.tobytes()).hexdigest()]
             case Array(element=element) | Sequence(element=element):
                 values = plain(value)
                 words = [word for one in values for word in self._words(element, one)]

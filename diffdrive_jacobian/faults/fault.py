@@ -12,17 +12,32 @@ import random
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import MISSING, dataclass, field, fields
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
+from rclpy.validate_topic_name import validate_topic_name
 
 from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.lockstep._injection import Undo as Undo
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
-from diffdrive_jacobian.numerics.fields import Checked, Name, Text
+from diffdrive_jacobian.numerics.fields import Checked, Text, nonempty
 
 LONG, SHOWN = 8, 2
 """Length beyond which a message shows the beginning of a sequence only, and how many elements of it."""
+
+
+def _ros_name(name: str, value: Any) -> str:
+    """Require the name of a topic or a service, relative names and private ones included."""
+    try:
+        validate_topic_name(nonempty(name, value))
+    except InvalidTopicNameException as error:
+        why = str(error).splitlines()[0].rstrip(':')
+        raise ValueError(f'{name} must be a name as ROS has them, got {value!r}: {why}') from None
+    return str(value)
+
+
+RosName = Annotated[str, _ros_name]
 
 
 @dataclass(frozen=True, repr=False)
@@ -154,7 +169,7 @@ class TopicFault(Fault):
         node: Name of the node whose subscriptions are affected (default: all).
     """
 
-    topic: Name
+    topic: RosName
     node: Text = field(default='', kw_only=True)
 
     keeps_order: ClassVar[bool] = False

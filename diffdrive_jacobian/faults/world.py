@@ -16,10 +16,11 @@ from rclpy.exceptions import ParameterUninitializedException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from diffdrive_jacobian.faults.fault import Fault, Undo
+from diffdrive_jacobian.faults.fault import Fault, RosName, Undo
+from diffdrive_jacobian.lockstep._clock import MAX_SECONDS
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._injection import Injection
-from diffdrive_jacobian.numerics.checks import Positive, PositiveOrInfinite, finite, number
+from diffdrive_jacobian.numerics.checks import Positive, PositiveOrInfinite, between
 from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.ros.rclpy_internals import PARAMETERS_OF_RCLPY, declared_parameters
 from diffdrive_jacobian.time_units import in_seconds, nanoseconds
@@ -180,8 +181,8 @@ class TimerJitter(NodeFault):
 
 
 def _jump(name: str, value: Any) -> float:
-    """Require a number of seconds that is not zero in nanoseconds."""
-    seconds = number(name, value, finite)
+    """Require a number of seconds that is not zero in nanoseconds, and that a stamp can represent."""
+    seconds = between(-MAX_SECONDS, MAX_SECONDS)(name, value)
     if nanoseconds(seconds) == 0:
         raise ValueError(f'{name} must not be zero, got {seconds!r}')
     return seconds
@@ -258,7 +259,7 @@ class LateService(Fault):
         seconds: Delay of each response (s); infinite: it is never sent.
     """
 
-    service: Name
+    service: RosName
     seconds: PositiveOrInfinite
 
     def install(self, injection: Injection) -> None:

@@ -120,6 +120,8 @@ class SimulatedTime:
     def run_until(self, condition: Callable[[], object], timeout: float, what: str) -> None:
         """Advance until a condition is true, as `Lockstep.run_until`."""
         __tracebackhide__ = True
+        if not callable(condition):
+            raise ValueError(f'condition must be a function, got {condition!r}')
         end = self._agenda.now + checked_nanoseconds('timeout', timeout)
         self.settle()
         while not condition():

@@ -32,6 +32,7 @@ from diffdrive_jacobian.lockstep._properties import Properties, Property
 from diffdrive_jacobian.lockstep._report import describe
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, checked_nanoseconds
+from diffdrive_jacobian.lockstep._waits import refuse_wait_for_message
 from diffdrive_jacobian.lockstep.external.node_process import Command, NodeProcess
 from diffdrive_jacobian.lockstep.external.process import end_all
 from diffdrive_jacobian.lockstep.external.quiet import check_platform
@@ -118,6 +119,7 @@ class Lockstep:
         self._scheduler = scheduler = Scheduler(context, self._start)
         self._closing.callback(self._destroy_nodes)
         self._closing.callback(scheduler.links.close)
+        self._closing.callback(refuse_wait_for_message())
         try:
             guard = Guard(patience, lambda: scheduler.nodes)
         except ValueError as error:
@@ -344,7 +346,7 @@ class Lockstep:
             what: Description of the condition for the error message.
 
         Raises:
-            ValueError: `timeout` is not positive, or too long.
+            ValueError: `condition` is no function, or `timeout` is not positive or too long.
             LockstepError: The condition did not become true in time, or time cannot advance.
         """
         __tracebackhide__ = True

@@ -11,10 +11,10 @@ from typing import Any, Generic, TypeVar
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.faults.fault import Expression
+from diffdrive_jacobian.faults.fault import Expression, RosName
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.names import full_name
-from diffdrive_jacobian.numerics.fields import Name, Text
+from diffdrive_jacobian.numerics.fields import Text
 from diffdrive_jacobian.properties._messages import Pose, Twist, read_pose, read_twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -142,7 +142,7 @@ class MotionProperty(Property):
             robot that drifts.
     """
 
-    odom: Name = field(default='odom', kw_only=True)
+    odom: RosName = field(default='odom', kw_only=True)
 
 
 M = TypeVar('M', bound=MotionProperty)

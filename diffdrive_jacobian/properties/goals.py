@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from diffdrive_jacobian.faults.fault import RosName
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, STAMP, Status
 from diffdrive_jacobian.messages.goal_status import (
@@ -21,7 +22,7 @@ from diffdrive_jacobian.messages.goal_status import (
     Stamp,
 )
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
-from diffdrive_jacobian.numerics.fields import Name, Names
+from diffdrive_jacobian.numerics.fields import Names
 from diffdrive_jacobian.properties._messages import Pose, Twist, field_reader, planar, read_twist
 from diffdrive_jacobian.properties.base import (
     ROUNDING,
@@ -87,7 +88,7 @@ class GoalProperty(MotionProperty):
     """
 
     goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
-    cancel: Name = field(default='cancel_goal', kw_only=True)
+    cancel: RosName = field(default='cancel_goal', kw_only=True)
 
 
 G = TypeVar('G', bound=GoalProperty)
@@ -270,8 +271,8 @@ class DueGoalProperty(GoalProperty):
 
     within: NotNegative
     tolerance: PositiveOrInfinite = field(default=0.05, kw_only=True)
-    status: Name = field(default='goal_status', kw_only=True)
-    commands: Name = field(default='cmd_vel', kw_only=True)
+    status: RosName = field(default='goal_status', kw_only=True)
+    commands: RosName = field(default='cmd_vel', kw_only=True)
 
 
 @dataclass(frozen=True, repr=False)
@@ -424,8 +425,8 @@ class NoCommandAfterCancel(Property):
         goals: Topics of the goals (default: ('goal_pose', 'goals')).
     """
 
-    cancel: Name = field(default='cancel_goal', kw_only=True)
-    commands: Name = field(default='cmd_vel', kw_only=True)
+    cancel: RosName = field(default='cancel_goal', kw_only=True)
+    commands: RosName = field(default='cmd_vel', kw_only=True)
     goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
@@ -483,7 +484,7 @@ class NoStaleGoals(Property):
         topic: Topic of type action_msgs/GoalStatus (default: 'goal_status').
     """
 
-    topic: Name = field(default='goal_status', kw_only=True)
+    topic: RosName = field(default='goal_status', kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""
@@ -539,7 +540,7 @@ class StatusProtocol(Property):
         goals: Topics of the goals (default: ('goal_pose', 'goals')).
     """
 
-    topic: Name = field(default='goal_status', kw_only=True)
+    topic: RosName = field(default='goal_status', kw_only=True)
     goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:

@@ -13,11 +13,17 @@ from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.control.path import PathProgress
+from diffdrive_jacobian.faults.fault import RosName
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.codecs import PATH
 from diffdrive_jacobian.messages.conversion import MAX_POSITION, MessageError
-from diffdrive_jacobian.numerics.checks import NotNegative, NotNegativeOrInfinite, PositiveOrInfinite
-from diffdrive_jacobian.numerics.fields import Name, Names
+from diffdrive_jacobian.numerics.checks import (
+    NotNegative,
+    NotNegativeOrInfinite,
+    Positive,
+    PositiveOrInfinite,
+)
+from diffdrive_jacobian.numerics.fields import Names
 from diffdrive_jacobian.properties._messages import Pose, Twist, field_reader, read_twist
 from diffdrive_jacobian.properties.base import (
     ROUNDING,
@@ -46,7 +52,7 @@ class TwistProperty(Property):
 
     v: NotNegativeOrInfinite
     omega: NotNegativeOrInfinite
-    topic: Name = field(default='cmd_vel', kw_only=True)
+    topic: RosName = field(default='cmd_vel', kw_only=True)
 
 
 @dataclass(frozen=True, repr=False)
@@ -98,7 +104,7 @@ class AccelerationWithin(TwistProperty):
             its odometry is lost (default: True).
     """
 
-    slack: NotNegative = field(default=0.1, kw_only=True)
+    slack: Positive = field(default=0.1, kw_only=True)
     stops: bool = field(default=True, kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
@@ -297,9 +303,9 @@ class StaysOnPath(MotionProperty):
     tolerance: NotNegative
     within: PositiveOrInfinite = field(default=math.inf, kw_only=True)
     after: NotNegative = field(default=0.0, kw_only=True)
-    path: Name = field(default='path', kw_only=True)
+    path: RosName = field(default='path', kw_only=True)
     goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
-    cancel: Name = field(default='cancel_goal', kw_only=True)
+    cancel: RosName = field(default='cancel_goal', kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""

@@ -9,9 +9,10 @@ from typing import Any, TypeVar
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from diffdrive_jacobian.faults.fault import RosName
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.numerics.checks import NotNegative
-from diffdrive_jacobian.numerics.fields import Name, Text
+from diffdrive_jacobian.numerics.fields import Text
 from diffdrive_jacobian.properties._messages import Twist, read_twist
 from diffdrive_jacobian.properties.base import (
     ROUNDING,
@@ -39,7 +40,7 @@ class ReactionProperty(MotionProperty):
 
     within: NotNegative
     node: Text = field(default='', kw_only=True)
-    commands: Name = field(default='cmd_vel', kw_only=True)
+    commands: RosName = field(default='cmd_vel', kw_only=True)
 
 
 R = TypeVar('R', bound=ReactionProperty)
@@ -223,7 +224,7 @@ class StopsOnShutdown(Property):
     """
 
     node: Text = field(default='', kw_only=True)
-    commands: Name = field(default='cmd_vel', kw_only=True)
+    commands: RosName = field(default='cmd_vel', kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import zip_longest
 from typing import Any
 
@@ -19,8 +19,8 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 class _Messages(MessageDigest):
     """Keeps each message as text, and the hash after it."""
 
-    def __init__(self, world: Lockstep) -> None:
-        super().__init__(world)
+    def __init__(self, world: Lockstep, without: Collection[str]) -> None:
+        super().__init__(world, without)
         self.all: list[tuple[int, str, str, str]] = []
 
     def _add(self, publisher: Publisher, message: Any) -> None:
@@ -31,7 +31,11 @@ class _Messages(MessageDigest):
 
 
 def check_repeats(
-    scenario: Callable[[Lockstep], object], *, runs: int = 2, args: Sequence[str] = ()
+    scenario: Callable[[Lockstep], object],
+    *,
+    runs: int = 2,
+    args: Sequence[str] = (),
+    without: Collection[str] = (),
 ) -> None:
     """Run a scenario in worlds of their own, and compare all messages, bit for bit.
 
@@ -42,14 +46,18 @@ def check_repeats(
         scenario: Receives a new `Lockstep`, adds nodes and lets time pass.
         runs: Number of runs.
         args: ROS arguments for all nodes, as of `Lockstep`.
+        without: Topics that are not compared, besides `/clock`, `/rosout` and `/parameter_events`.
 
     Raises:
+        ValueError: `without` is not names of topics such as '/odom'.
         LockstepError: Two runs differ. The message names the first message that does.
     """
+    if isinstance(without, str) or any(not topic.startswith('/') for topic in without):
+        raise ValueError(f"without must be names of topics such as '/odom', got {without!r}")
     first: list[tuple[int, str, str, str]] | None = None
     for number in range(runs):
         with Lockstep(args) as world:
-            messages = _Messages(world)
+            messages = _Messages(world, without)
             with messages:
                 scenario(world)
                 world.finish()

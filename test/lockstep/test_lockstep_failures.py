@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import suppress
 
 import pytest
+import rclpy.wait_for_message
 from geometry_msgs.msg import Vector3
 from nav_msgs.msg import Odometry
 from rclpy.clock import JumpThreshold
@@ -16,7 +18,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
-from std_msgs.msg import Header
+from rclpy.wait_for_message import wait_for_message
+from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
 from users_nodes import Blinker, Echo
 
@@ -102,14 +105,70 @@ def test_a_callback_that_blocks_is_named(impatient, wait):
     assert 'innocent' not in first
 
 
-def test_a_service_that_calls_another_and_waits_is_named(impatient):
-    node = Node('deadlocked')
+def call(client):
+    client.call(Trigger.Request())
+
+
+def call_for_a_while(client):
+    with suppress(Exception):
+        client.call(Trigger.Request(), timeout_sec=0.2)
+
+
+def poll(client):
+    future, end = client.call_async(Trigger.Request()), time.monotonic() + 0.3
+    while not future.done() and time.monotonic() < end:
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    ('wait', 'how'),
+    [(call, 'client.call'), (call_for_a_while, 'client.call'), (poll, 'future.done')],
+)
+def test_a_callback_that_waits_for_a_response_is_named_also_with_a_timeout(lockstep, wait, how):
+    node = Node('waiting')
     client = node.create_client(Trigger, 'other')
-    impatient.node.create_service(Trigger, 'other', lambda _, response: response)
-    node.create_service(Trigger, 'ask', lambda request, _: client.call(request))
-    impatient.add(node)
-    with pytest.raises(LockstepError, match=r'service /ask, node /deadlocked.* in wait'):
-        impatient.call(Trigger, 'ask')
+    lockstep.node.create_service(Trigger, 'other', lambda _, response: response)
+    node.create_timer(0.1, lambda: wait(client))
+    with pytest.raises(
+        LockstepError,
+        match=rf'at 1 s: node /waiting waits for a response of /other \({how}\), in {wait.__name__} '
+        r'\(.*test_lockstep_failures.py:\d+\): it cannot arrive',
+    ):
+        lockstep.add(node)
+        lockstep.run_for(0.3)
+
+
+def test_a_callback_may_look_whether_a_response_has_come(lockstep):
+    node, seen = Node('looking'), []
+    client = node.create_client(Trigger, 'other')
+    lockstep.node.create_service(Trigger, 'other', lambda _, response: response)
+    future = None
+
+    def tick():
+        nonlocal future
+        future = future or client.call_async(Trigger.Request())
+        seen.append(any(future.done() for _ in range(3)))
+
+    node.create_timer(0.1, tick)
+    lockstep.add(node)
+    lockstep.run_for(0.25)
+    assert seen[:2] == [False, True]
+    again = client.call_async(Trigger.Request())
+    lockstep.run_until(again.done, 1.0)
+
+
+def test_a_callback_that_waits_for_a_message_is_named(lockstep):
+    node = lockstep.add(Node('waiting'))
+    node.create_timer(0.1, lambda: wait_for_message(Float64, node, 'value', time_to_wait=0.2))
+    with pytest.raises(LockstepError, match='wait_for_message waits for a message, in <lambda>'):
+        lockstep.run_for(0.3)
+
+
+def test_wait_for_message_is_as_before_when_the_world_has_ended():
+    before = rclpy.wait_for_message.SignalHandlerGuardCondition
+    with Lockstep():
+        assert rclpy.wait_for_message.SignalHandlerGuardCondition is not before
+    assert rclpy.wait_for_message.SignalHandlerGuardCondition is before
 
 
 def test_a_jump_callback_that_blocks_is_named(impatient):
@@ -134,10 +193,13 @@ def test_endless_callbacks_are_named(impatient):
     assert any('/a: ' in line and 'from /pong' in line for line in rest)
 
 
-def test_a_timer_without_a_period_is_named(impatient):
-    impatient.node.create_timer(0.0, lambda: None)
-    with pytest.raises(LockstepError, match=r'callbacks without end: .*timer of 0 s, node /lockstep'):
-        impatient.run_for(1.0)
+@pytest.mark.parametrize('period', [0.0, 1e-9, 9e-7])
+def test_a_timer_that_would_stop_the_time_is_refused(lockstep, period):
+    lockstep.node.create_timer(period, lambda: None)
+    with pytest.raises(
+        LockstepError, match=rf'/lockstep has a period of {period * 1e9:.0f} ns; .* 1000'
+    ):
+        lockstep.run_for(1.0)
 
 
 def test_a_callback_that_sleeps_on_its_clock_is_named(lockstep):

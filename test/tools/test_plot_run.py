@@ -97,7 +97,7 @@ def test_the_axes_show_the_run_with_units(run):
     plane, axes = made.axes[0], by_label(made)
     assert plane.get_aspect() == 1.0
     assert (plane.get_xlabel(), plane.get_ylabel()) == ('x [m]', 'y [m]')
-    of_paths = {LABELS[name] for name in ('across', 'along', 'path_heading_error')}
+    of_paths = {LABELS[name] for name in ('across', 'along', 'path_heading_error', 'late')}
     assert set(axes) == {'y [m]', *LABELS.values()} - of_paths
     assert 'limit' in legends(made)
     assert {one.get_xlabel() for one in axes.values()} == {'x [m]', 'time [s]', ''}
