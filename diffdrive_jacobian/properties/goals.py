@@ -12,7 +12,8 @@ from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.faults.fault import RosName
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, STAMP, Status
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, PATH, POSE, STAMP, Status
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.goal_status import (
     FOLLOWING,
     UNSTAMPED,
@@ -50,6 +51,7 @@ class SentGoal(NamedTuple):
 _read_goal = field_reader(lambda kind: GOALS.fields if kind.__name__ == 'Goals' else POSE.fields)
 _read_status = field_reader(lambda _: GOAL_STATUS.fields)
 _read_stamp = field_reader(lambda _: STAMP)
+_read_path = field_reader(lambda _: PATH.fields)
 _read_identifier = field_reader(lambda _: ('goal_info.goal_id.uuid',))
 
 
@@ -65,6 +67,18 @@ def read_goal(message_type: type, message: Any, seconds: float) -> SentGoal | No
             return None
         pose = [column[-1] for column in columns]
     return SentGoal(planar(*pose), seconds, (int(sec), int(nanosec)))
+
+
+def read_path(message_type: type, message: Any, seconds: float) -> SentGoal | None:
+    """Return the end of a path as a goal; None: there is none."""
+    fields = _read_path(message_type, message)
+    try:
+        route = None if fields is None else PATH.value(*fields)
+    except MessageError:
+        return None
+    if route is None or not route.poses:
+        return None
+    return SentGoal(Pose(*route.poses[-1]), seconds, route.stamp)
 
 
 def read_status(message_type: type, message: Any) -> Status | None:
@@ -84,10 +98,12 @@ class GoalProperty(MotionProperty):
     Attributes:
         goals: Topics of the goals, of type PoseStamped or Goals, of which the last one counts (default:
             ('goal_pose', 'goals')).
+        path: Topic of paths, which replace a goal, of type nav_msgs/Path (default: 'path').
         cancel: Service that cancels the goal (default: 'cancel_goal').
     """
 
     goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
+    path: RosName = field(default='path', kw_only=True)
     cancel: RosName = field(default='cancel_goal', kw_only=True)
 
 
@@ -121,7 +137,13 @@ class _PublishedGoalWatch(_GoalWatch[G]):
         world.expect(*map(required.resolved, required.goals))
         for topic in required.goals:
             world.on_published(required.resolved(topic), self._on_goal)
+        world.on_published(required.resolved(required.path), self._on_path)
         world.on_response(required.resolved(required.cancel), self._on_cancel)
+
+    def _on_path(self, publisher: Publisher, message: Any) -> None:
+        if read_path(publisher.msg_type, message, self.seconds) is not None:
+            self.goal = None
+            self.note('a path replaces the goal')
 
     def _on_goal(self, publisher: Publisher, message: Any) -> None:
         self.goal = read_goal(publisher.msg_type, message, self.seconds)
@@ -139,8 +161,8 @@ class ReachesGoal(GoalProperty):
 
     It stands at a goal when a message of its odometry has a pose within `tolerance` of the goal (and
     within `yaw_tolerance` of its heading), and a twist of at most 0.01 m/s and 0.05 rad/s. A goal is
-    not due any longer when another one was published, or the cancel service has responded. A run that
-    ends before a goal is reached violates the property: let it run longer. Time is world time.
+    not due any longer when another one or a path was published, or the cancel service has responded. A
+    run that ends before a goal is reached violates the property: let it run longer. Time is world time.
 
     Attributes:
         within: Longest time (s).
@@ -194,8 +216,8 @@ class Settles(GoalProperty):
     """The robot is close to each goal after a settling time, and stays there.
 
     Later than `within` after a goal was published each pose of the odometry must be within `tolerance`
-    of it, until another goal is published or the cancel service has responded. A run that ends before
-    `within` after a goal violates the property: let it run longer. Time is world time.
+    of it, until another goal or a path is published or the cancel service has responded. A run that
+    ends before `within` after a goal violates the property: let it run longer. Time is world time.
 
     Attributes:
         within: Settling time (s).
@@ -252,8 +274,9 @@ def end_of_faults(world: Lockstep) -> float:
 class DueGoalProperty(GoalProperty):
     """A property of the goals that a controller has received. Base class.
 
-    A controller is a node that is subscribed to a topic of `goals` and publishes `commands`. It has the
-    goal that it received last. That is due until the robot has stood within `tolerance` of it, or
+    A controller is a node that is subscribed to a topic of `goals` or to `path` and publishes
+    `commands`. It has the goal that it received last, of a path its end. That is due until the robot has
+    stood within `tolerance` of it, or
 
     - the cancel service of the node has responded,
     - the node has published CANCELED or ABORTED for it (with the stamp of the goal) on `status`,
@@ -321,16 +344,22 @@ class _DueGoalWatch(_GoalWatch[DueGoalProperty]):
         self._followers: defaultdict[Node, GoalFollower[SentGoal]] = defaultdict(GoalFollower)
         self._received: dict[Node, FollowedGoal[SentGoal]] = {}
         self.moved = self.seconds
-        world.expect(*map(required.resolved, required.goals))
+        world.expect(*map(required.resolved, (*required.goals, required.path)))
         for topic in required.goals:
             world.on_delivered(required.resolved(topic), self._on_goal)
+        world.on_delivered(required.resolved(required.path), self._on_path)
         self._commands = world.node.resolve_topic_name(required.resolved(required.commands))
         world.expect(self._commands)
         world.on_published(required.resolved(required.status), self._on_status)
         world.on_response(required.resolved(required.cancel), self._on_cancel)
 
     def _on_goal(self, node: Node, message_type: type, message: Any) -> None:
-        goal = read_goal(message_type, message, self.seconds)
+        self._take(node, read_goal(message_type, message, self.seconds))
+
+    def _on_path(self, node: Node, message_type: type, message: Any) -> None:
+        self._take(node, read_path(message_type, message, self.seconds))
+
+    def _take(self, node: Node, goal: SentGoal | None) -> None:
         if goal is None or not any(one.topic_name == self._commands for one in node.publishers):
             return
         self._received[node] = self._followers[node].sent(goal, goal.stamp)
@@ -416,18 +445,18 @@ class _KeepsDrivingWatch(_DueGoalWatch):
 class NoCommandAfterCancel(Property):
     """A controller publishes no command that moves the robot after its cancel service has responded.
 
-    It may do so again when it has received another goal. Whether the response reports success does not
-    matter. Commands of zero are allowed. Commands of other nodes do not count.
+    It may do so again when it has received another goal or a path. Whether the response reports success
+    does not matter. Commands of zero are allowed. Commands of other nodes do not count.
 
     Attributes:
         cancel: Service that cancels the goal (default: 'cancel_goal').
         commands: Topic of type Twist or TwistStamped (default: 'cmd_vel').
-        goals: Topics of the goals (default: ('goal_pose', 'goals')).
+        goals: Topics of the goals and paths (default: ('goal_pose', 'goals', 'path')).
     """
 
     cancel: RosName = field(default='cancel_goal', kw_only=True)
     commands: RosName = field(default='cmd_vel', kw_only=True)
-    goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
+    goals: Names = field(default=('goal_pose', 'goals', 'path'), kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""
@@ -537,11 +566,11 @@ class StatusProtocol(Property):
 
     Attributes:
         topic: Topic of type action_msgs/GoalStatus (default: 'goal_status').
-        goals: Topics of the goals (default: ('goal_pose', 'goals')).
+        goals: Topics of the goals and paths (default: ('goal_pose', 'goals', 'path')).
     """
 
     topic: RosName = field(default='goal_status', kw_only=True)
-    goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
+    goals: Names = field(default=('goal_pose', 'goals', 'path'), kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""

@@ -129,13 +129,17 @@ def test_a_callback_that_waits_for_a_response_is_named_also_with_a_timeout(locks
     client = node.create_client(Trigger, 'other')
     lockstep.node.create_service(Trigger, 'other', lambda _, response: response)
     node.create_timer(0.1, lambda: wait(client))
+
+    def run():
+        lockstep.add(node)
+        lockstep.run_for(0.3)
+
     with pytest.raises(
         LockstepError,
         match=rf'at 1 s: node /waiting waits for a response of /other \({how}\), in {wait.__name__} '
         r'\(.*test_lockstep_failures.py:\d+\): it cannot arrive',
     ):
-        lockstep.add(node)
-        lockstep.run_for(0.3)
+        run()
 
 
 def test_a_callback_may_look_whether_a_response_has_come(lockstep):

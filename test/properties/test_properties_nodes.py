@@ -117,6 +117,57 @@ def test_no_command_after_cancel(lockstep, robot_at, scene):
     violated(lockstep, 0.1, r'v 0.2 m/s, .* 0.02 s after /student has responded to /cancel_goal')
 
 
+# --- Paths beside goals
+
+
+@pytest.fixture
+def with_paths(lockstep):
+    """A robot and its controller, and a function that sends a path of a length (m)."""
+    lockstep.add(make(VirtualRobot, publish_rate=50.0))
+    lockstep.controller = lockstep.add(go_to_goal())
+    lockstep.run_for(0.1)
+    stamps = iter(range(1, 99))
+    lockstep.send_path = lambda length: lockstep.publish(
+        'path', path((0.0, 0.0), (length / 2.0, 0.0), (length, 0.0), stamp=next(stamps))
+    )
+    return lockstep
+
+
+def test_a_path_after_a_cancel_is_driven_without_an_accusation(with_paths):
+    with_paths.require(NoCommandAfterCancel())
+    with_paths.require(StatusProtocol())
+    with_paths.send_path(2.0)
+    with_paths.run_for(0.5)
+    assert with_paths.call(Trigger, 'cancel_goal').success
+    with_paths.send_path(2.0)
+    with_paths.run_for(0.5)
+    assert with_paths.last('cmd_vel').linear.x > 0.1
+    with_paths.finish()
+
+
+@pytest.mark.parametrize('required', [ReachesGoal(2.0), Settles(2.0, tolerance=0.1)])
+def test_a_goal_that_a_path_replaced_is_not_due_any_longer(with_paths, required):
+    with_paths.require(required)
+    with_paths.publish('goal_pose', goal_at(-3.0, stamp=50))
+    with_paths.run_for(0.5)
+    with_paths.send_path(2.0)
+    with_paths.run_for(3.0)
+    with_paths.finish()
+
+
+@pytest.mark.parametrize('required', [KeepsDriving, ArrivesOnceFaultsEnd])
+def test_the_end_of_a_path_is_a_goal_of_its_controller(with_paths, required):
+    with_paths.require(required(20.0))
+    with_paths.send_path(1.0)
+    with_paths.run_until(lambda: with_paths.last('goal_status').status == SUCCEEDED, 15.0)
+    with_paths.run_for(1.0)
+    with_paths.finish()
+    assert change(with_paths.controller, **{'linear.x.max_velocity': 0.0}).successful
+    with_paths.require(required(1.0))
+    with_paths.send_path(3.0)
+    violated(with_paths, 9.0, r'the robot (has stood for 1.02 s|is .* of /go_to_goal at x 3 m)')
+
+
 def test_a_service_that_no_node_has_is_an_error_at_the_end(lockstep, robot_at):
     robot_at()
     lockstep.add(Student())
