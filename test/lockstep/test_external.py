@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 import signal
 import sys
 from collections import Counter
@@ -28,6 +29,7 @@ from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.exploration.trial import MessageDigest
 from diffdrive_jacobian.faults import ClockPause, Corrupt, Delay, Hang, Kill, Loss, Slow, TimeJump
 from diffdrive_jacobian.lockstep.external import node_process
+from diffdrive_jacobian.lockstep.external.launch import shared_memory_of
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.properties import NeverFasterThan
@@ -474,6 +476,19 @@ def test_the_elements_of_large_arrays_are_hashed_at_once(monkeypatch):
 
 
 # --- Start and end
+
+
+@pytest.mark.parametrize('end', ['stop', 'kill', 'close'])
+def test_a_process_leaves_no_shared_memory_behind(end):
+    with Lockstep() as world:
+        process = world.start(command('echo'))
+        world.run_for(0.1)
+        segments = shared_memory_of(process.child.pid)
+        assert segments
+        assert all(map(os.path.exists, segments))
+        if end != 'close':
+            getattr(process, end)()
+    assert not any(map(os.path.exists, segments))
 
 
 def test_rules_of_the_user_stay_and_a_last_message_is_received(lockstep):

@@ -8,6 +8,7 @@ none is missed. It ends as the command does.
 """
 
 import ctypes
+import fcntl
 import os
 import resource
 import select
@@ -16,6 +17,7 @@ import sys
 
 PR_SET_CHILD_SUBREAPER = 36
 ADDR_NO_RANDOMIZE = 0x0040000
+SEGMENT = '/dev/shm/fastrtps_'
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 """Signals to the group, which are for the command."""
 
@@ -47,10 +49,13 @@ def main() -> None:
     while status is None and 0 not in select.select([0, reader], [], [])[0]:
         os.read(reader, 100)
         status = ended_children(os.WNOHANG).get(pid)
+    segments: set[str] = set()
     while children := own_children():
         for child in children:
+            segments |= shared_memory_of(child)
             os.kill(child, signal.SIGKILL)
         status = ended_children(0).get(pid, status)
+    remove_abandoned(segments)
     code = os.waitstatus_to_exitcode(status or 0)
     if code >= 0:
         os._exit(code)
@@ -58,6 +63,29 @@ def main() -> None:
     if -code not in (signal.SIGKILL, signal.SIGSTOP):
         signal.signal(-code, signal.SIG_DFL)
     os.kill(os.getpid(), -code)
+
+
+def shared_memory_of(pid: int) -> set[str]:
+    """Return the files of Fast DDS in shared memory that a process has mapped."""
+    try:
+        with open(f'/proc/{pid}/maps', encoding='utf-8', errors='replace') as maps:
+            mapped = {line.split(maxsplit=5)[-1].strip() for line in maps if SEGMENT in line}
+    except OSError:
+        return set()
+    return {name for name in mapped if name.startswith(SEGMENT)}
+
+
+def remove_abandoned(segments: set[str]) -> None:
+    """Remove the files of processes that were killed. Those of living ones are locked (`NAME_el`)."""
+    for name in segments:
+        try:
+            with open(f'{name}_el', 'rb') as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                os.unlink(name)
+                os.unlink(f'{name}_el')
+        except OSError:
+            # It is in use, or has gone, or has no lock.
+            pass
 
 
 def own_children() -> list[int]:

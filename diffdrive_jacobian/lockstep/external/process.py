@@ -17,6 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep.external.launch import remove_abandoned, shared_memory_of
 from diffdrive_jacobian.ros.fastdds_profiles import VARIABLE
 from diffdrive_jacobian.ros.runner import DISCOVERY
 from diffdrive_jacobian.text import printable
@@ -113,6 +114,7 @@ class ExternalProcess:
         """Called while it is waited for: Python notices a signal only when its node is woken up."""
         self._files = [tempfile.TemporaryFile() for _ in range(2)]  # noqa: SIM115
         self._printed = ['', '']
+        self._segments: set[str] = set()
         # Not what isolates this process, or the profiles of Fast DDS that it uses.
         inherited = {
             name: value for name, value in os.environ.items() if name not in (VARIABLE, *DISCOVERY)
@@ -186,6 +188,8 @@ class ExternalProcess:
         if number == signal.SIGKILL:
             self.kill()
         elif self.returncode is None:
+            # A program that ends by an exception of its handler leaves them, too.
+            self._segments |= shared_memory_of(self.pid)
             os.killpg(self.root, number)
 
     def stop(self, timeout: float = CLOSING) -> int:
@@ -200,7 +204,9 @@ class ExternalProcess:
         while (code := self.returncode) is None and time.monotonic() < end:
             self.wake()
             time.sleep(NAP)
-        return self.kill() if code is None else code
+        code = self.kill() if code is None else code
+        remove_abandoned(self._segments)
+        return code
 
     def kill(self) -> int:
         """Kill it with all that it has started. Return the exit code."""
