@@ -15,6 +15,7 @@ import sysconfig
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from functools import partial
 from types import FrameType
 from typing import Any
@@ -180,6 +181,13 @@ def _runs(frame: FrameType, callback: Any) -> str:
     function = getattr(callback, '__func__', callback)
     if getattr(function, '__code__', None) is not frame.f_code:
         return ''
+    # Functions of one definition, as that which decodes the messages of our nodes, differ in what they
+    # enclose.
+    variables = frame.f_locals
+    for name, cell in zip(frame.f_code.co_freevars, function.__closure__ or (), strict=False):
+        with suppress(ValueError):
+            if variables.get(name) is not cell.cell_contents:
+                return ''
     owner = getattr(callback, '__self__', None)
     if owner is not None and frame.f_locals.get(frame.f_code.co_varnames[0]) is not owner:
         return ''

@@ -21,8 +21,13 @@ from rclpy.task import Future
 from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
+from support.lockstep_nodes import make
+from support.ros_messages import goal
 from users_nodes import Blinker, Echo
 
+from diffdrive_jacobian.control import Controller
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
 
@@ -103,6 +108,21 @@ def test_a_callback_that_blocks_is_named(impatient, wait):
     assert first.startswith('at 1 s: Blocking.on_tick (timer of 0.1 s, node /blocking, ')
     assert 'has not returned for 0.5 s of wall time; it is at ' in first
     assert 'innocent' not in first
+
+
+def test_a_law_that_loops_is_named_with_its_node(impatient):
+    """All subscriptions of our nodes share the code of one decoder."""
+    impatient.add(make(VirtualRobot))
+    law = Controller(name='loops', summary='never returns', law=lambda *_: forever())
+    impatient.add(GoToGoal(controller=law))
+
+    def run():
+        impatient.publish('goal_pose', goal(1.0, 0.0))
+        impatient.run_for(1.0)
+
+    named = r'GoToGoal._on_odometry \(subscribed to /odom, node /go_to_goal'
+    with pytest.raises(LockstepError, match=named):
+        run()
 
 
 def call(client):
