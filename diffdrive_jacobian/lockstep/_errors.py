@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.ros.rclpy_internals import RCLError
 
 
 class LockstepError(DiffdriveError):
@@ -76,3 +79,31 @@ def described(value: Any) -> str:
     if isinstance(value, type):
         return f'the class {value.__name__}'
     return f"'{value}'" if isinstance(value, str) else f'an object of the class {type(value).__name__}'
+
+
+_TWO_TYPES = re.compile(r'existing topic name rt(/\S+) with incompatible type (\w+)::msg::dds_::(\w+)_')
+
+
+@contextmanager
+def one_type_per_topic() -> Iterator[None]:
+    """Explain the error of rcl about a topic that has another type in this process.
+
+    Raises:
+        LockstepError: There is one.
+    """
+    try:
+        yield
+    except RCLError as error:
+        if (found := _TWO_TYPES.search(str(error))) is None:
+            raise
+        topic, package, kind = found.groups()
+        hint = ''
+        if kind.startswith('Twist'):
+            hint = (
+                '. The nodes of this package take TwistStamped with enable_stamped_cmd_vel, for example '
+                "VirtualRobot(parameter_overrides=[Parameter('enable_stamped_cmd_vel', value=True)])"
+            )
+        raise LockstepError(
+            f'{topic} cannot have the type {package}/msg/{kind}: another node of this world uses it '
+            f'with another type{hint}'
+        ) from error

@@ -21,7 +21,12 @@ import rclpy
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.lockstep._errors import InitializedError, LockstepError, described
+from diffdrive_jacobian.lockstep._errors import (
+    InitializedError,
+    LockstepError,
+    described,
+    one_type_per_topic,
+)
 from diffdrive_jacobian.lockstep._fault_log import FaultEvent
 from diffdrive_jacobian.lockstep._faults import Faults
 from diffdrive_jacobian.lockstep._guard import Guard
@@ -234,7 +239,8 @@ class Lockstep:
         self._check_open()
         if isinstance(factory, Node) or not callable(factory):
             raise LockstepError(f'create takes a function that returns a node, got {described(factory)}')
-        node = self.add(factory())
+        with one_type_per_topic():
+            node = self.add(factory())
         self._nodes.created(node, factory)
         return node
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+import sys
 import threading
 
 import pytest
 import rclpy
-from geometry_msgs.msg import Twist, Vector3
+from geometry_msgs.msg import Twist, TwistStamped, Vector3
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
@@ -17,8 +18,10 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Empty, Trigger
+from support.lockstep_nodes import make
 from users_nodes import Blinker, Echo
 
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -424,3 +427,36 @@ def test_what_is_sent_before_a_node_was_added_or_in_another_context_does_not_cou
     in_a_thread(node.publish)
     with refused(PUBLISHES):
         lockstep.run_for(0.1)
+
+
+@pytest.mark.process
+def test_a_controller_of_stamped_twists_beside_a_robot_of_others_is_explained(lockstep):
+    lockstep.add(make(VirtualRobot))
+
+    class Stamped(Node):
+        def __init__(self):
+            super().__init__('stamped')
+            self.create_publisher(TwistStamped, 'cmd_vel', 10)
+
+    match = '/cmd_vel cannot have the type geometry_msgs/msg/TwistStamped: .* enable_stamped_cmd_vel'
+    with pytest.raises(LockstepError, match=match):
+        lockstep.create(Stamped)
+    with pytest.raises(LockstepError, match=match):
+        lockstep.start([sys.executable, '-c', STAMPED])
+
+
+STAMPED = """
+import rclpy
+from geometry_msgs.msg import TwistStamped
+from rclpy.node import Node
+
+rclpy.init()
+node = Node('stamped')
+node.create_publisher(TwistStamped, 'cmd_vel', 10)
+rclpy.spin(node)
+"""
+
+
+def test_a_condition_that_is_no_function_is_refused(lockstep):
+    with pytest.raises(ValueError, match='condition must be a function, got True'):
+        lockstep.run_until(True, 1.0)
