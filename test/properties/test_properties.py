@@ -23,6 +23,7 @@ from diffdrive_jacobian.properties import (
     Settles,
     StatusProtocol,
     StaysNear,
+    StaysOnPath,
     StaysWithin,
     StopsAfterLastCommand,
     StopsAfterLostOdometry,
@@ -137,7 +138,14 @@ VALUES = [
     (StaysWithin([0, 1], y=(-1, 1)), 'StaysWithin((0.0, 1.0), (-1.0, 1.0))'),
     (StaysNear([[0, 0], [1, 0]], 0.1), 'StaysNear(((0.0, 0.0), (1.0, 0.0)), 0.1)'),
     (PoseFinite(), 'PoseFinite()'),
+    (StaysOnPath(0.1), 'StaysOnPath(0.1)'),
 ]
+
+
+def test_every_property_is_among_the_values():
+    public = (getattr(properties, name) for name in properties.__all__)
+    kinds = {one for one in public if isinstance(one, type) and issubclass(one, properties.Property)}
+    assert {type(one) for one, _ in VALUES} == kinds - {properties.Property}
 
 
 def test_properties_are_values():

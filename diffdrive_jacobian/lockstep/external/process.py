@@ -28,6 +28,8 @@ PARTICIPANTS = 32
 """Number of participants of a domain whose ports are looked at. Each process has one or more."""
 SHOWN_LINES = 15
 """Number of lines that an error quotes of what a process printed."""
+TITLE = 160
+"""Most characters of a command line that an error quotes, so that its reason follows soon."""
 LINE = 500
 """Most characters of a line that an error quotes."""
 CLOSING = 5.0
@@ -106,7 +108,7 @@ class ExternalProcess:
         """
         self.command = shlex.join(command)
         """The command line."""
-        self.title = printable(self.command, LINE)
+        self.title = printable(self.command, TITLE)
         """The command line as errors name it."""
         self.ended_by_test = False
         """Whether the test has ended it."""
