@@ -205,14 +205,14 @@ class Waypoints:
 
         It may roll to that goal by way of the waypoints, but not out of the tolerance again where it
         heads past the goal. While it turns in place it may turn to the heading, and what is left of the
-        tolerance limits how far it rolls, at least a tenth of it. The turn is infinite before.
+        tolerance limits how far it rolls, at least a fiftieth of it. The turn is infinite before.
         """
         x, y, theta = pose
         tolerance, goal = arrival.xy_tolerance, self._goal
         distance = float(distance_to_goal.formula(x, y, theta, *goal[:2], arrival.offset))
         if self.turning:
             turn = abs(float(heading_error.formula(theta, goal[2])))
-            return max(tolerance - distance, tolerance / 10.0), turn
+            return max(tolerance - distance, tolerance / 50.0), turn
         if self.index + 1 < len(self.poses):
             legs = np.hypot(*np.diff(self.poses[self.index :, :2], axis=0).T)
             return distance + float(legs.sum()), math.inf
