@@ -114,7 +114,7 @@ class Path:
         if poses.shape[-1] == 2:
             poses = np.column_stack([poses, np.zeros(len(poses))])
         with np.errstate(over='ignore'):
-            new = np.hypot(*np.diff(poses[:, :2], axis=0).T) > REPEATED
+            new = _new(poses[:, :2])
         if not new.any():
             raise ValueError(f'poses must have two different positions, got {len(poses)} in one place')
         distinct = poses[np.concatenate([[True], new]), :2]
@@ -304,6 +304,19 @@ class PathProgress:
     def remaining(self) -> float:
         """Arc length to the end and distance from the path together, as in a right triangle (m)."""
         return hypot(self.path.length - self.s, self.across)
+
+
+def _new(positions: Floats) -> NDArray[np.bool_]:
+    """Return whether each position after the first is another one than the last that was."""
+    new: NDArray[np.bool_] = np.hypot(*np.diff(positions, axis=0).T) > REPEATED
+    if not new.all():
+        # Those that are left out may creep away.
+        x, y = positions[0].tolist()
+        for index, (next_x, next_y) in enumerate(positions[1:].tolist()):
+            new[index] = hypot(next_x - x, next_y - y) > REPEATED
+            if new[index]:
+                x, y = next_x, next_y
+    return new
 
 
 def _times(times: ArrayLike, count: int) -> Floats:

@@ -200,30 +200,36 @@ class Waypoints:
             return here, None if arrival.stopped(*twist) else STANDSTILL
         return here, turn_in_place(theta, heading, turning_gain)
 
-    def remaining(self, pose: Pose, arrival: Arrival) -> tuple[float, float]:
+    def remaining(self, pose: Pose, arrival: Arrival, turn: float = 0.0) -> tuple[float, float]:
         """Return how far a robot may still roll and turn, so that it can stop at the last goal (m, rad).
 
         It may roll to that goal by way of the waypoints, but not out of the tolerance again where it
         heads past the goal. While it turns in place it may turn to the heading, and what is left of the
-        tolerance limits how far it rolls, at least a fiftieth of it. The turn is infinite before.
+        tolerance limits how far it rolls. The turn is infinite before. A fiftieth of the tolerance is
+        always left, so that a robot at its rim gets on.
+
+        Args:
+            pose: Pose of the robot, shape (3,).
+            arrival: Arrival criterion.
+            turn: The turn until it rests (rad): it rolls along an arc.
         """
         x, y, theta = pose
         tolerance, goal = arrival.xy_tolerance, self._goal
         distance = float(distance_to_goal.formula(x, y, theta, *goal[:2], arrival.offset))
         if self.turning:
-            turn = abs(float(heading_error.formula(theta, goal[2])))
-            return max(tolerance - distance, tolerance / 50.0), turn
+            left = abs(float(heading_error.formula(theta, goal[2])))
+            return max(tolerance - distance, tolerance / 50.0), left
         if self.index + 1 < len(self.poses):
             legs = np.hypot(*np.diff(self.poses[self.index :, :2], axis=0).T)
             return distance + float(legs.sum()), math.inf
-        # Of the line ahead: where it leaves the circle of the tolerance, if it meets it.
-        cosine, sine = math.cos(theta), math.sin(theta)
+        # Of the chord of the arc: where it leaves the circle of the tolerance, if it meets it.
+        cosine, sine = math.cos(theta + turn / 2.0), math.sin(theta + turn / 2.0)
         dx, dy = goal[0] - x, goal[1] - y
         ahead, beside = cosine * dx + sine * dy - arrival.offset, cosine * dy - sine * dx
         leaves = ahead + math.sqrt(max(tolerance**2 - beside**2, 0.0))
         if abs(beside) > tolerance or leaves < 0.0:
             leaves = 0.0
-        return max(distance - tolerance, min(distance, leaves)), math.inf
+        return max(distance - 0.98 * tolerance, min(distance, leaves)), math.inf
 
     def resumed(self) -> Waypoints:
         """Return the waypoints with the last position to be checked again.

@@ -33,7 +33,7 @@ class Act(Enum):
     EXPIRE = auto()
     """Publish a zero: the page was silent, and must release the keys before it drives again."""
     GIVE_UP = auto()
-    """Report that the goal was not canceled; nothing was driven."""
+    """Publish a zero if it has driven (`moved`), and report that the goal was not canceled."""
 
 
 class HandDriving:
@@ -55,12 +55,20 @@ class HandDriving:
         """Take a command of a page. Return False if another page drives."""
         if self.page not in (None, page):
             return False
+        if page == self.page and now - self._commanded > DEAD_MAN:
+            # The program was busy, and has not noticed yet.
+            self._silent.add(page)
         if page in self._silent:
             return True
         if self.page is None:
             self._canceling, self._moved, self._published = None, False, -math.inf
         self.page, self.twist, self._commanded, self._released = page, twist, now, False
         return True
+
+    @property
+    def moved(self) -> bool:
+        """Whether anything was published since the page began to drive."""
+        return self._moved
 
     def release(self, page: int) -> None:
         """Take the end of driving by a page."""
@@ -89,6 +97,7 @@ class HandDriving:
                 self._canceling = now
                 return Act.CANCEL_GOAL
             if now - self._canceling > CANCEL_PATIENCE:
+                self._silent.add(self.page)
                 self.page = None
                 return Act.GIVE_UP
             return Act.NOTHING

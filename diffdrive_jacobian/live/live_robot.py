@@ -344,6 +344,8 @@ class LiveRobot:
             self._session.notify('driving by hand: the goal is canceled')
             self._call('cancel_goal')
         elif act is Act.GIVE_UP:
+            if self.hand.moved:
+                self.topics.publish_twist(STANDSTILL, self._now())
             self._warn('the controller did not cancel its goal: the robot is not driven by hand')
 
     def _rolls_on(self) -> str:

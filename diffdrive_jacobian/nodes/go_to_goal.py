@@ -335,7 +335,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if before is not None:
             self._publish_status(before.info, GoalStatus.STATUS_CANCELED)
         if before is not None and before.same_path(goal):
-            goal.path, goal.waypoints, goal.stepped = before.path, before.waypoints, before.stepped
+            goal.path, goal.waypoints = before.path, before.waypoints
+            goal.begun, goal.stepped = before.begun, before.stepped
         else:
             self._law.reset()
             self._path_law.reset()
@@ -490,14 +491,15 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         now: int,
     ) -> tuple[float, float]:
         """Return a command from which the robot can stop at the last goal."""
-        offset = 0.0
-        if goal.path is not None:
-            room = goal.path.remaining()
-        else:
-            room = goal.waypoints.remaining(pose, self._arrival)
-            if not goal.waypoints.turning:
-                # A turn in place moves the driven point in any case.
-                offset = float(self._arrival.offset)
+        # A turn in place moves the driven point in any case.
+        straight = goal.path is not None or goal.waypoints.turning
+        offset = 0.0 if straight else float(self._arrival.offset)
+
+        def room(turn: float) -> tuple[float, float]:
+            if goal.path is not None:
+                return goal.path.remaining()
+            return goal.waypoints.remaining(pose, self._arrival, turn)
+
         return braking.limited(now, self._twist, command, room, 1.0 / self._rate, offset=offset)
 
     def _begin(self, goal: Goal, pose: tuple[float, float, float]) -> bool:

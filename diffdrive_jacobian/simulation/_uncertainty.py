@@ -30,6 +30,8 @@ from diffdrive_jacobian.simulation.speeds import Course, Piece, sign_changes, tr
 
 MAX_NOISE = 0.25
 """Largest m of a step of the quadrature."""
+MOST_STEPS = 32
+"""Most steps of a piece for its noise. With more the standard deviation of the heading exceeds 4 rad."""
 
 
 def moments_along(
@@ -49,16 +51,27 @@ def moments_along(
                 abs(travelled(rim, end, piece.tau) - travelled(rim, begin, piece.tau))
                 for rim in (right, left)
             )
-            count = max(1, math.ceil(k * distance / (2.0 * L * L) / MAX_NOISE))
+            count = max(1, min(math.ceil(k * distance / (2.0 * L * L) / MAX_NOISE), MOST_STEPS))
+            lost = k * distance / (2.0 * L * L) > MOST_STEPS * MAX_NOISE
             for number in range(count):
                 if found is None:
                     return None
                 first = begin + (end - begin) * number / count
                 step = piece.part(first, begin + (end - begin) * (number + 1) / count)
+                if lost:
+                    # The heading is not known any more, however it was driven.
+                    step = _evenly(step)
                 found = _after(found, theta + travelled(piece.omega, first, piece.tau), step, L, k)
     except (OverflowError, ValueError):
         return None
     return found if found is not None and all(map(isfinite, found)) else None
+
+
+def _evenly(piece: Piece) -> Piece:
+    """Return a piece with the same path and turn at constant speeds."""
+    _, _, path, turn = piece.state(piece.seconds)
+    v, omega = path / piece.seconds, turn / piece.seconds
+    return Piece(piece.seconds, (v, 0.0, 0.0), (omega, 0.0, 0.0))
 
 
 def _rims(piece: Piece, L: float) -> tuple[Course, Course]:

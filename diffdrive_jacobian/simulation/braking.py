@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 
 from diffdrive_jacobian.simulation.actuators import STANDSTILL, AccelerationLimits, Actuators
 from diffdrive_jacobian.simulation.speeds import Twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-HALVINGS = 12
-"""Of the interval in which the share of a command is searched: it is found to 1/4096."""
+HALVINGS = 20
+"""Of the interval in which the share of a command is searched: it is found to 1e-6."""
 
 
 class Braking:
@@ -54,7 +55,7 @@ class Braking:
         stamp: int,
         twist: Twist,
         command: Twist,
-        room: Twist,
+        room: Callable[[float], Twist],
         period: float,
         *,
         offset: float = 0.0,
@@ -65,7 +66,8 @@ class Braking:
             stamp: The time (ns).
             twist: Twist of the robot at that time, by its odometry (m/s, rad/s).
             command: The command `(v, omega)`.
-            room: The distance and the turn that are left; infinite: any (m, rad).
+            room: Returns the distance and the turn that are left, where the robot comes to rest after a
+                turn; infinite: any (m, rad).
             period: Time from this command to the next one (s).
             offset: X coordinate in the body frame of the point for which the distance counts (m).
         """
@@ -92,8 +94,9 @@ class Braking:
             target = share * command[0], share * command[1]
             held, way = _followed(then, target, limits, period, coming)
             _, (distance, turn) = _followed(held, STANDSTILL, limits, math.inf, way)
+            most, most_turn = room(turn)
             turn = abs(turn)
-            return abs(distance) + abs(offset) * turn <= room[0] and turn <= room[1]
+            return abs(distance) + abs(offset) * turn <= most and turn <= most_turn
 
         if fits(1.0):
             return command

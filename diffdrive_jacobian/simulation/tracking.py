@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from types import SimpleNamespace
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +29,7 @@ from diffdrive_jacobian.kinematics.inverse_velocity import manipulability
 from diffdrive_jacobian.numerics.checks import array, leading, not_negative, number, positive
 from diffdrive_jacobian.numerics.fields import instance, short
 from diffdrive_jacobian.numerics.formula import Array
-from diffdrive_jacobian.simulation.robot import Robot, RobotModel
+from diffdrive_jacobian.simulation.robot import STANDSTILL, Robot, RobotModel
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_STEPS = 1e8
@@ -283,8 +283,10 @@ def follow_path(
     )
     follower = PathFollower(path)
     end = path.poses_at(path.length)
-    samples, finished = [], False
-    for now in range(0, round(number('timeout', timeout, positive) * NANOSECONDS), period):
+    samples: list[tuple[Any, ...]] = []
+    finished = False
+    duration = max(1, round(number('timeout', timeout, positive) * NANOSECONDS))
+    for now in range(0, duration, period):
         law.now = now
         pose = robot.true_pose_tuple if localised else robot.pose_tuple
         follower, command = follower.follow(
@@ -293,9 +295,9 @@ def follow_path(
         if command is None:
             # The time of a trajectory is over. Then the end is driven to as a goal.
             finished = math.hypot(*(end[:2] - pose[:2])) <= settings.end_tolerance
-            if finished:
+            if finished and samples:
                 break
-            command = law_of_goals(pose, end)
+            command = STANDSTILL if finished else law_of_goals(pose, end)
         time = now / NANOSECONDS
         planned = math.nan if path.times is None else min(follower.elapsed, path.duration)
         reference = follower.reference(settings)

@@ -111,6 +111,21 @@ def test_the_figure_eight_is_the_lemniscate():
         assert here.omega == pytest.approx(3.0 * math.cos(at) * math.sqrt(c), abs=0.04)
 
 
+def test_positions_that_creep_are_one_position():
+    """As those of a robot that stands: each is near the one before, and the last one is the first."""
+    for positions in (
+        [(0, 0), (0.9e-6, 0), (1.8e-6, 0), (0, 0), (1, 0)],
+        [(0, 0), (1, 0), (1, 0.9e-6), (1, 1.8e-6), (1, 0), (2, 0)],
+    ):
+        path = Path(np.array(positions, dtype=float))
+        assert path.length == pytest.approx(positions[-1][0], abs=1e-5)
+        for s in np.linspace(0.0, path.length, 50):
+            assert np.isfinite(path.at(s, 1.0)).all()
+        assert path.nearest(0.5, 0.1) == pytest.approx(0.5, abs=1e-5)
+    with pytest.raises(ValueError, match='must have two different positions'):
+        Path(np.array([(0, 0), (0.9e-6, 0), (0.5e-6, 0), (0, 0)]))
+
+
 def test_a_corner_stays_a_corner_and_a_line_a_line():
     square = Path([(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)])
     assert (square.length, square.closed) == (4.0, False)

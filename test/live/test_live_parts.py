@@ -125,6 +125,29 @@ def test_a_page_that_was_silent_must_release_the_keys_before_it_drives_again(han
     assert hand.twist == (0.1, 0.0)
 
 
+def test_a_silence_that_the_program_has_slept_through_ends_the_driving_too(hand):
+    """The first command after it comes before the first look."""
+    assert ask(hand, 10.0) is Act.PUBLISH
+    assert hand.command(1, (0.2, 0.0), now=15.0)
+    assert ask(hand, 15.0) is Act.EXPIRE
+    assert hand.command(1, (0.2, 0.0), now=15.1)
+    assert ask(hand, 15.1) is Act.NOTHING
+
+
+def test_what_was_driven_before_a_goal_that_is_not_canceled_is_stopped(hand):
+    assert ask(hand, 10.0) is Act.PUBLISH
+    for step in range(30):
+        now = 10.1 + 0.1 * step
+        hand.command(1, (0.2, 0.0), now=now)
+        if (act := ask(hand, now, goal_active=True)) is Act.GIVE_UP:
+            break
+    assert act is Act.GIVE_UP
+    assert hand.moved
+    # The key is still held.
+    assert hand.command(1, (0.2, 0.0), now=now + 0.1)
+    assert ask(hand, now + 0.1) is Act.NOTHING
+
+
 def test_commands_are_spaced_by_the_clock_of_the_robot(hand):
     """However often it is asked, and also if the clock is set back to 1.0."""
     times = (5.0, 5.0, 5.03, 5.041, 5.05, 1.0, 1.03, 1.05)
@@ -154,6 +177,7 @@ def test_nothing_is_driven_before_an_active_goal_is_canceled(hand):
         acts.append(ask(hand, now, goal_active=True))
     nothing = [Act.NOTHING] * (waits - 1)
     assert acts == [Act.CANCEL_GOAL, *nothing, Act.GIVE_UP, *nothing]
+    assert not hand.moved
 
 
 # --- Pace

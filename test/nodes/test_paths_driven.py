@@ -8,8 +8,10 @@ import re
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus
 from nav_msgs.msg import Path as PathMessage
 from support.bags import status
+from support.lockstep_nodes import make
 from support.ros_messages import goal, odometry, path, receive, time_of
 from support.runs import STRAIGHT, run_of
 
@@ -67,6 +69,20 @@ def test_how_late_a_robot_is_that_is_too_slow_for_a_trajectory_is_said_everywher
     labels = [axes.get_ylabel() for axes in figure([one.run]).axes]
     assert 'along path [m]' in labels
     assert 'behind the times [s]' not in labels
+
+
+def test_a_trajectory_that_is_sent_again_is_as_late_as_before(lockstep, capfd):
+    lockstep.add(make(VirtualRobot, **{'linear.x.max_velocity': 0.1}))
+    lockstep.add(make(GoToGoal))
+    lockstep.run_for(0.1)
+    status = lockstep.listen(GoalStatus, 'goal_status')
+    for stamp in (1, 2):
+        sent = path((0.0, 0.0), (0.5, 0.0), times=[1.0, 2.0], stamp=stamp)
+        lockstep.publish('path', sent)
+        lockstep.run_for(3.0)
+    lockstep.run_until(lambda: status[-1].status == GoalStatus.STATUS_SUCCEEDED, 30.0)
+    (late,) = re.findall(r'goal reached, ([0-9.]+) s later', capfd.readouterr().err)
+    assert float(late) > 6.0
 
 
 def test_a_robot_that_still_moves_is_not_said_to_have_stopped(capsys):

@@ -15,6 +15,7 @@ from support.lockstep_nodes import CANCELED, SUCCEEDED, Controller, Topics, chan
 from support.ros_messages import at_rest, goal, odometry
 
 from diffdrive_jacobian.control import VelocityLimits
+from diffdrive_jacobian.drives import drive
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.stopping import overshoot_warnings, rolls_on
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -65,7 +66,7 @@ def test_a_braked_robot_comes_to_rest_within_the_room_wherever_it_is_stopped(lag
             if number % 25 == 0:
                 command = chance.uniform(0.0, 0.5), chance.uniform(-1.0, 1.0)
             left = room - travelled(robot)[0], turn - abs(travelled(robot)[1])
-            v, omega = braking.limited(stamp, robot.twist, command, left, 0.02)
+            v, omega = braking.limited(stamp, robot.twist, command, lambda _, left=left: left, 0.02)
             assert v * command[1] == pytest.approx(omega * command[0])
             braking.sent(stamp, (v, omega))
             robot = robot.commanded((v, omega), stamp)
@@ -89,21 +90,47 @@ def test_braking_uses_the_twist_by_the_odometry_and_the_point_that_is_driven():
     """Straight on, without delay and lag: v <= sqrt(2 a D)."""
     limits = AccelerationLimits(v=AxisLimits(max_deceleration=-0.1))
     braking = Braking(Actuators(acceleration=limits))
-    v, omega = braking.limited(0, (0.0, 0.0), (1.0, 0.0), (0.2, math.inf), 0.0)
+    v, omega = braking.limited(0, (0.0, 0.0), (1.0, 0.0), lambda _: (0.2, math.inf), 0.0)
     assert (v, omega) == (pytest.approx(math.sqrt(2.0 * 0.1 * 0.2), abs=1e-3), 0.0)
     # It is faster than what was commanded, and decelerates.
-    assert braking.limited(SECOND, (0.3, 0.0), (0.1, 0.0), (0.2, math.inf), 0.0) == (0.0, 0.0)
+    assert braking.limited(SECOND, (0.3, 0.0), (0.1, 0.0), lambda _: (0.2, math.inf), 0.0) == (0.0, 0.0)
     # The yaw rate decelerates at once, but a point off the axle moves with it.
     turning = Actuators(acceleration=AccelerationLimits(omega=AxisLimits(max_deceleration=-0.5)))
-    v, omega = Braking(turning).limited(0, (0.0, 0.0), (0.0, 2.0), (0.1, math.inf), 0.0, offset=0.1)
+    v, omega = Braking(turning).limited(
+        0, (0.0, 0.0), (0.0, 2.0), lambda _: (0.1, math.inf), 0.0, offset=0.1
+    )
     assert (v, omega) == (0.0, pytest.approx(1.0, abs=1e-3))
 
 
 def test_braking_starts_anew_when_the_clock_is_set_back():
     braking = Braking(dataclasses.replace(ACTUATORS, lag=0.0))
     for stamp in (100 * SECOND, SECOND):
-        assert braking.limited(stamp, (0.3, 0.0), (0.3, 0.0), (2.0, math.inf), 0.02) == (0.3, 0.0)
+        assert braking.limited(stamp, (0.3, 0.0), (0.3, 0.0), lambda _: (2.0, math.inf), 0.02) == (
+            0.3,
+            0.0,
+        )
         braking.sent(stamp, (0.3, 0.0))
+
+
+@pytest.mark.parametrize(
+    ('goal', 'limits', 'law'),
+    [
+        # Just outside of the tolerance, and aside: the room must not vanish at its rim.
+        ((-0.01616, -0.01212, 0.0), (0.3, 1.0, 1.0), {}),
+        ((-0.5, 0.0, 0.0), (1.0, 0.3, 0.2), {'controller': 'offset_point', 'offset': 0.3}),
+    ],
+)
+def test_a_robot_that_stops_in_time_arrives_and_rests_within_the_tolerance(goal, limits, law):
+    v, omega, fastest = limits
+    known = {
+        'linear.x.max_acceleration': v,
+        'angular.z.max_acceleration': omega,
+        'linear.x.max_velocity': fastest,
+    }
+    parameters = {**known, **law, 'stop_in_time': True}
+    outcome = drive([goal], lockstep=True, timeout=60.0, parameters=parameters, robot_parameters=known)
+    assert outcome.arrived
+    assert outcome.distance <= 0.02 + fastest * 0.02
 
 
 def test_the_description_is_empty_where_nothing_is_to_be_said():
