@@ -6,7 +6,7 @@
 - At its end, the last pose is a goal like any other.
 
 Each step takes the robot's pose and returns the next command. The time of a trajectory advances
-while the law of the path drives.
+while the law of the path drives, and waits for a robot that is late.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class PathFollower:
         path = self.path
         s = path.nearest(x, y, self.s, forward=True)
         nearest = path.at(s, 0.0)
-        if hypot(nearest.x - x, nearest.y - y) > how.approach_distance:
+        if far := hypot(nearest.x - x, nearest.y - y) > how.approach_distance:
             # On the way to the path there is no progress along it.
             s = self.s
         here = replace(self, s=s, index=self._next(x, y, s, how.waypoint_tolerance))
@@ -102,9 +102,12 @@ class PathFollower:
             return replace(here, index=len(path.poses) - 1, elapsed=elapsed), None
         reference = here.reference(how)
         away = hypot(reference.x - x, reference.y - y)
-        if away > how.approach_distance:
+        if far or (away > how.approach_distance and path.times is None):
             law.reset()
             return here, law_of_goals(pose, np.array(reference[:3]))
+        if away > how.approach_distance:
+            # A robot that is late, but on the path, goes on along it while the trajectory waits.
+            dt = 0.0
         if abs(wrap(reference.theta - theta)) > pi / 2.0:
             law.reset()
             return here, turn_in_place.formula(theta, reference.theta, how.turning_gain)

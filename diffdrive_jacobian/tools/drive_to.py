@@ -247,7 +247,8 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
         if outcome.distance > outcome.tolerance:
             print(
                 f'the robot rolled out of the tolerance of {outcome.tolerance:g} m: the parameters '
-                'stop_in_time and trans_stopped_velocity avoid that'
+                'stop_in_time and trans_stopped_velocity avoid that, if go_to_goal knows the limits of '
+                'the robot and wheel_bridge has none of its own'
             )
         return DONE
     if outcome.interrupted:

@@ -1,7 +1,7 @@
 """What one message costs, in counts: a loss of speed that no test of time would notice fails here.
 
-Who raises a limit says why in the commit. Limits are those of today, with 1 % for bytecodes, and 3 % on
-the executor, where a busy machine adds up to 1.5 %.
+Who raises a limit says why in the commit. Limits are those of today, with 1 % for bytecodes, and 5 % on
+the executor, where a busy machine adds up to 4 %.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ LIMITS = {
 }
 BYTECODES = {
     'lockstep': {(3, 10): 4500, (3, 11): 4600, (3, 12): 4330, (3, 13): 4130},
-    'executor': {(3, 10): 4880, (3, 11): 4930, (3, 12): 4720, (3, 13): 4400},
+    'executor': {(3, 10): 4980, (3, 11): 5030, (3, 12): 4810, (3, 13): 4490},
     'batch': {(3, 10): 1930, (3, 11): 2040, (3, 12): 1870, (3, 13): 1730},
 }
 """Limits by version of Python; others have none."""
-SLACK = 0.05
+SLACK = 0.08
 """Share of a limit by which a count may be below it. A limit that is too high would notice nothing."""
 
 

@@ -7,6 +7,7 @@ import signal
 import socket
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -124,7 +125,9 @@ def test_what_is_created_later_and_cannot_take_part_is_named(lockstep, number, w
 def test_what_a_process_sends_by_itself_is_an_error(lockstep):
     lockstep.start(command('walltimer', 'threaded'), clock_period=1.0)
     for name in ('walltimer', 'threaded'):
-        send(lockstep, name, 0.0)
+        # On a busy machine the other one may publish at this moment, too.
+        with suppress(LockstepError):
+            send(lockstep, name, 0.0)
         said = ''
         while f'published /{name}/out' not in said.replace('/walltimer/out, published ', ''):
             with fails(
