@@ -133,19 +133,29 @@ def test_a_key_drives_and_letting_go_stops(live):
 
 def test_a_frozen_page_drives_again_only_after_the_key_was_released(live):
     browser = live.browser
+
+    def still():
+        place = live.pose()
+        time.sleep(0.5)
+        return live.pose() == place
+
     browser.key('Down', 'KeyW')
-    live.state('by hand')
-    browser.freeze(1.0)
-    # It is back, the key is still held, and the page goes on asking.
-    browser.until('document.getElementById("notices").innerText.includes("release the keys")')
-    live.settled()
-    place = live.pose()
-    time.sleep(0.5)
-    assert live.pose() == place
-    browser.key('Up', 'KeyW')
+    try:
+        live.state('by hand')
+        browser.freeze(1.0)
+        # It is back, the key is still held, and the page goes on asking.
+        browser.until('document.getElementById("notices").innerText.includes("release the keys")')
+        # The page first shows what it has missed. A robot that is driven stands never.
+        until(still, 'the robot stands')
+        assert still()
+        browser.until('document.getElementById("state").innerText !== "by hand"')
+    finally:
+        browser.key('Up', 'KeyW')
     browser.key('Down', 'KeyW')
-    live.state('by hand')
-    browser.key('Up', 'KeyW')
+    try:
+        live.state('by hand')
+    finally:
+        browser.key('Up', 'KeyW')
     live.settled()
 
 
