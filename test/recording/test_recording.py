@@ -327,8 +327,10 @@ def test_what_was_missed_or_left_out_is_reported_also_after_a_crash(tmp_path):
         recording.set_left_out(f'/topic_{number}', 'it has several types')
 
     def noted():
-        keys = {one.key for one in read_journal(journal_of(bag)) if isinstance(one, Text)}
-        return {LOST, LEFT_OUT} <= keys
+        records = read_journal(journal_of(bag))
+        keys = {one.key for one in records if isinstance(one, Text)}
+        # The messages are written after them.
+        return {LOST, LEFT_OUT} <= keys and sum(isinstance(one, Message) for one in records) == 3
 
     until(noted, 'both are noted')
     shutil.copy(journal_of(bag), tmp_path / 'crashed.journal.mcap')
