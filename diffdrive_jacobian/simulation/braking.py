@@ -120,7 +120,8 @@ class Braking:
                 break
             sent.popleft()
         self._stamp = stamp
-        if self._demanded == STANDSTILL and len(sent) == 1 and sent[0] <= (stamp, STANDSTILL):
+        ended = len(sent) == 1 and sent[0][0] <= stamp and sent[0][1] == STANDSTILL
+        if ended and self._demanded == STANDSTILL:
             # What moves the robot from now on, others command.
             sent.clear()
             self._demanded = None
