@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import heapq
 import math
-import warnings
 from collections.abc import Callable, Iterable
 from itertools import count
 from operator import itemgetter
@@ -17,7 +16,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
-from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._wall_time import check_timer
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.ros.rclpy_internals import (
     RCLError,
@@ -29,9 +28,6 @@ from diffdrive_jacobian.ros.rclpy_internals import (
 )
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-PACKAGE = 'diffdrive_jacobian.'
-SHORTEST_PERIOD = 1000
-"""Shortest period of a timer (ns)."""
 MAX_SECONDS = 2**31 - 1
 """Largest time that fits into a stamp (s)."""
 Entry = tuple[TimerHandle, Timer, Node]
@@ -143,7 +139,7 @@ class Timers:
             simulated = follows_sim_time(timer)
             if timer not in self._seen:
                 self._seen.add(timer)
-                _check_timer(timer, node, simulated=simulated)
+                check_timer(timer, node, simulated=simulated)
             of_kind = self._sim_timers if simulated else self._wall_timers
             of_kind.append((handle.time_until_next_call, (handle, timer, node)))
         self.simulated = {timer for _, (_, timer, _) in self._sim_timers}
@@ -184,26 +180,6 @@ class Timers:
             if owner is node and timer in self.simulated:
                 return -left, handle, timer
         return None
-
-
-def _check_timer(timer: Timer, node: Node, *, simulated: bool) -> None:
-    """Refuse a timer with which simulated time would not get on; warn of one on wall time."""
-    period, name = timer.timer_period_ns, node.get_fully_qualified_name()
-    # Those of our own nodes check the graph, or expire once.
-    own = str(getattr(timer.callback, '__module__', '')).startswith(PACKAGE)
-    if own:
-        return
-    if simulated and period < SHORTEST_PERIOD:
-        raise LockstepError(
-            f'a timer of node {name} has a period of {period} ns; in lockstep it must be at least '
-            f'{SHORTEST_PERIOD} ns, because simulated time stops at each tick'
-        )
-    if not simulated:
-        warnings.warn(
-            f'a timer of node {name} with a period of {period / NANOSECONDS:g} s is not on the clock of '
-            'the node but on wall time: what it does differs from run to run, check_repeats shows it',
-            stacklevel=2,
-        )
 
 
 def is_due(handle: TimerHandle) -> bool:

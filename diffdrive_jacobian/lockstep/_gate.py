@@ -14,6 +14,8 @@ from rclpy.timer import Timer
 
 from diffdrive_jacobian.lockstep._clock import Agenda
 
+__tracebackhide__ = True
+
 FREE = object()
 """Result of a callback that has done nothing, and therefore takes no time."""
 

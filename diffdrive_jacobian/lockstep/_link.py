@@ -25,6 +25,8 @@ from diffdrive_jacobian.lockstep._clock import Agenda
 from diffdrive_jacobian.lockstep._gate import Gate
 from diffdrive_jacobian.ros.rclpy_internals import queue_depth
 
+__tracebackhide__ = True
+
 Stage: TypeAlias = Callable[[bytes], Iterable[tuple[int, bytes]]]
 """Receives a serialized message, returns those that leave the stage instead, with their delays (ns)."""
 Taken: TypeAlias = tuple[Any, dict[str, Any]]

@@ -30,6 +30,8 @@ from diffdrive_jacobian.lockstep._services import Member
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import message_receiver, message_taker, wrap_publish
 
+__tracebackhide__ = True
+
 Filter = Callable[[Source | Link], Stage | None]
 """Returns the stage of a fault at one end of a link; None: the fault does not affect it."""
 

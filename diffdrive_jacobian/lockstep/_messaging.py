@@ -19,6 +19,8 @@ from diffdrive_jacobian.messages.names import node_of, type_name
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
 from diffdrive_jacobian.time_units import NANOSECONDS
 
+__tracebackhide__ = True
+
 LISTENING_DEPTH = 1000
 """Queue size of `listen`: the number of messages of a topic at one simulated time."""
 

@@ -19,6 +19,8 @@ from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
 from diffdrive_jacobian.time_units import NANOSECONDS
 
+__tracebackhide__ = True
+
 
 class Watch(Protocol):
     """What observes one run for a property."""
@@ -98,7 +100,6 @@ class Properties:
 
     def check(self) -> None:
         """Check what is required at the current time, when all callbacks have been executed."""
-        __tracebackhide__ = True
         for required in self.required:
             if (text := required.watch.check()) is not None:
                 self.required.remove(required)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import inspect
 import math
 import threading
+import warnings
 import weakref
 from collections.abc import Callable
 from typing import Any
@@ -29,12 +30,16 @@ from diffdrive_jacobian.lockstep._link import is_latched
 from diffdrive_jacobian.lockstep._links import Links, SentElsewhere
 from diffdrive_jacobian.lockstep._services import Member, Responses, check_holdable
 from diffdrive_jacobian.lockstep._tasks import Tasks
+from diffdrive_jacobian.lockstep._wall_time import Qualities
+from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import (
     TimerHandle,
     events_executor,
     on_new_node,
     wrap_calls,
 )
+
+__tracebackhide__ = True
 
 LATCHED_PATIENCE = Duration(seconds=5.0)
 """Longest time for a latched message to reach a later subscription (s). It takes microseconds."""
@@ -72,6 +77,7 @@ class Scheduler:
         self.clocks = Clocks(start)
         self.timers = Timers()
         self.tasks = Tasks()
+        self._qualities = Qualities()
         self.gates = Gates(self.agenda)
         self.gates.changed = self._on_gate
         self.links = Links(self.agenda, self.gates, self.clocks)
@@ -79,6 +85,7 @@ class Scheduler:
         self._restore_calls = wrap_calls(self._noting)
         self._context = context
         self._created: list[weakref.ref[Node]] = []
+        self._missing: weakref.WeakSet[Node] = weakref.WeakSet()
         self._restore_nodes = on_new_node(self._note_node)
         self.links.start(self._members, self.note_thread)
 
@@ -124,6 +131,22 @@ class Scheduler:
         """The nodes of the context that were not destroyed, added or not."""
         nodes = [created() for created in self._created]
         return [node for node in nodes if node is not None and not _is_destroyed(node)]
+
+    def warn_of_missing(self) -> None:
+        """Warn of nodes that have something to do, and were created but not added."""
+        for node in self.existing:
+            if node in self._members or node in self._missing:
+                continue
+            topics = [
+                one.topic_name for one in node.subscriptions if one.topic_name not in NOT_OF_ROBOTS
+            ]
+            if topics or list(node.timers):
+                self._missing.add(node)
+                warnings.warn(
+                    f'node {node.get_fully_qualified_name()} was created, but not added: none of its '
+                    'callbacks is called; lockstep.add(node) adds it',
+                    stacklevel=2,
+                )
 
     @property
     def nodes(self) -> list[Node]:
@@ -384,6 +407,7 @@ class Scheduler:
             for publisher in node.publishers:
                 if is_latched(publisher):
                     publisher.wait_for_all_acked(LATCHED_PATIENCE)
+            self._qualities.check(node)
             member.update()
             self.registered(node)
         self._events.wake()

@@ -24,6 +24,8 @@ from diffdrive_jacobian.lockstep._gate import Gate, send_unless_destroyed
 from diffdrive_jacobian.lockstep._tasks import Facade, Tasks
 from diffdrive_jacobian.ros.rclpy_internals import queue_depth
 
+__tracebackhide__ = True
+
 Responded: TypeAlias = Callable[[Node, Service, Any], None]
 """Receives a node, its service, and a response, also one that a fault delays."""
 

@@ -1,7 +1,4 @@
-"""Simulated time that advances from one timer to the next.
-
-`__tracebackhide__` lets pytest show the line of the test instead of those of this module.
-"""
+"""Simulated time that advances from one timer to the next."""
 
 from __future__ import annotations
 
@@ -21,6 +18,8 @@ from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
 from diffdrive_jacobian.time_units import NANOSECONDS
+
+__tracebackhide__ = True
 
 T = TypeVar('T')
 SHUT_DOWN = 'rclpy was shut down: only lockstep may do that'
@@ -68,14 +67,12 @@ class SimulatedTime:
 
     def settle(self) -> None:
         """Execute all callbacks that are due at the current time."""
-        __tracebackhide__ = True
         self._check_open()
         self._until_next = self.execute(self._scheduler.settle)
         self._finish()
 
     def settle_unless_busy(self) -> None:
         """Settle, except within a callback, after which it happens anyway."""
-        __tracebackhide__ = True
         if not self.busy:
             self.settle()
 
@@ -87,14 +84,12 @@ class SimulatedTime:
 
     def _settle_processes(self) -> None:
         """Check the other processes, and execute what that causes."""
-        __tracebackhide__ = True
         # One at a time: what a process still sends may be for another one.
         while any(process.check() for process in self.processes):
             self._until_next = self.execute(self._scheduler.settle)
 
     def _finish(self) -> None:
         """Check the processes and what is required, when all callbacks of a time have been executed."""
-        __tracebackhide__ = True
         if self.processes:
             self._settle_processes()
         if self.check is not None:
@@ -102,7 +97,6 @@ class SimulatedTime:
 
     def step(self, at_most: float | None) -> None:
         """Advance to the time at which the next timer expires, as `Lockstep.step`."""
-        __tracebackhide__ = True
         end = math.inf if at_most is None else self._agenda.now + checked_nanoseconds('at_most', at_most)
         self._catch_up()
         if self._until_next == math.inf and at_most is None:
@@ -111,18 +105,18 @@ class SimulatedTime:
 
     def run_for(self, seconds: float) -> None:
         """Advance by a duration (s), as `Lockstep.run_for`."""
-        __tracebackhide__ = True
         end = self._agenda.now + checked_nanoseconds('seconds', seconds)
+        self._scheduler.warn_of_missing()
         self.settle()
         while self._agenda.now < end:
             self._advance(end)
 
     def run_until(self, condition: Callable[[], object], timeout: float, what: str) -> None:
         """Advance until a condition is true, as `Lockstep.run_until`."""
-        __tracebackhide__ = True
         if not callable(condition):
             raise ValueError(f'condition must be a function, got {condition!r}')
         end = self._agenda.now + checked_nanoseconds('timeout', timeout)
+        self._scheduler.warn_of_missing()
         self.settle()
         while not condition():
             if self._agenda.now >= end:
@@ -136,7 +130,6 @@ class SimulatedTime:
 
     def jump(self, seconds: float) -> None:
         """Jump by a duration (s), as `Lockstep.jump`."""
-        __tracebackhide__ = True
         if not math.isfinite(seconds) or seconds == 0.0:
             raise ValueError(f'seconds must be finite and not zero, got {seconds!r}')
         before = self._clocks.now / NANOSECONDS
@@ -153,7 +146,6 @@ class SimulatedTime:
 
     def _advance(self, end: float) -> None:
         """Advance to the next timer or action, but not beyond an end of world time (ns)."""
-        __tracebackhide__ = True
         agenda = self._agenda
         # The minimum of integers is exact, also beside infinity.
         passed = int(min(self._until_next, end - agenda.now))
@@ -164,7 +156,6 @@ class SimulatedTime:
 
     def arrive(self) -> None:
         """Set the clocks of the nodes to the present time, and execute what is due then."""
-        __tracebackhide__ = True
         self._until_next = self.execute(self._scheduler.advance)
         if self.processes or self.check is not None:
             self._finish()
@@ -173,7 +164,6 @@ class SimulatedTime:
 
     def execute(self, work: Callable[[], T]) -> T:
         """Call a function that executes callbacks, and return its result."""
-        __tracebackhide__ = True
         if self.busy:
             raise LockstepError('a callback cannot advance time, and cannot add or remove nodes')
         self.busy, guard = True, self._guard

@@ -13,6 +13,8 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._gate import Gate
 from diffdrive_jacobian.ros.rclpy_internals import new_task
 
+__tracebackhide__ = True
+
 
 class Tasks:
     """Tasks that are not done."""
@@ -117,7 +119,9 @@ class Facade:
         if not self.released:
             raise LockstepError(
                 f'node {node.get_fully_qualified_name()} is in lockstep and cannot be spun by another '
-                'executor'
+                'executor, as by rclpy.spin, spin_once or spin_until_future_complete. A callback that '
+                'needs a response awaits the future of call_async; a test lets time pass by '
+                'lockstep.run_for, and calls services by lockstep.call'
             )
 
     def wake(self) -> None:

@@ -19,6 +19,8 @@ from rclpy.task import Future
 
 from diffdrive_jacobian.lockstep._guard import Stuck
 
+__tracebackhide__ = True
+
 POLLS = 3
 """Number of times that a callback may find a response missing, at one time."""
 

@@ -46,6 +46,9 @@ from diffdrive_jacobian.ros.rclpy_internals import refuse_init
 from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
 from diffdrive_jacobian.time_units import NANOSECONDS
 
+__tracebackhide__ = True
+# So pytest shows the lines of tests and callbacks, not those between them. Here and in other modules.
+
 ISOLATED = ('--ros-args', '-p', 'start_type_description_service:=false')
 """ROS arguments before those of the user: only tools in other processes call that service, and it takes
 time to create."""
@@ -317,7 +320,6 @@ class Lockstep:
 
     def settle(self) -> None:
         """Execute all callbacks that are due at the current time."""
-        __tracebackhide__ = True
         self._time.settle()
 
     def step(self, at_most: float | None = None) -> None:
@@ -330,7 +332,6 @@ class Lockstep:
             ValueError: `at_most` is not positive, or too long.
             LockstepError: No timer is running and `at_most` is not given, or time cannot advance.
         """
-        __tracebackhide__ = True
         self._time.step(at_most)
 
     def run_for(self, seconds: float) -> None:
@@ -340,7 +341,6 @@ class Lockstep:
             ValueError: `seconds` is not positive, or too long.
             LockstepError: Time cannot advance.
         """
-        __tracebackhide__ = True
         self._time.run_for(seconds)
 
     def run_until(self, condition: Callable[[], object], timeout: float, what: str = '') -> None:
@@ -355,7 +355,6 @@ class Lockstep:
             ValueError: `condition` is no function, or `timeout` is not positive or too long.
             LockstepError: The condition did not become true in time, or time cannot advance.
         """
-        __tracebackhide__ = True
         self._time.run_until(condition, timeout, what)
 
     def jump(self, seconds: float) -> None:
@@ -366,7 +365,6 @@ class Lockstep:
         Raises:
             ValueError: `seconds` is zero or not finite, or the new time does not fit into a stamp.
         """
-        __tracebackhide__ = True
         self._time.jump(seconds)
 
     # --- Messages and services

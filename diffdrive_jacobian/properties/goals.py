@@ -188,15 +188,20 @@ class _ReachesWatch(_PublishedGoalWatch[ReachesGoal]):
             and pose.distance(goal.pose) <= required.tolerance
             and abs(math.remainder(pose.theta - goal.pose.theta, math.tau)) <= required.yaw_tolerance
         ):
-            self.check()
+            passed = self.seconds - goal.seconds
+            if passed > required.within + ROUNDING:
+                self.found(
+                    f'the robot stood at the goal {passed:g} s after it was published; allowed: '
+                    f'{required.within:g} s'
+                )
             self.goal = None
 
     def check(self) -> str | None:
         goal, required = self.goal, self.required
-        if goal is not None and self.seconds - goal.seconds > required.within + ROUNDING:
+        if goal is not None and (passed := self.seconds - goal.seconds) > required.within + ROUNDING:
             self.found(
-                f'{required.within:g} s after the goal was published {self.where(goal)}; allowed: '
-                f'within {required.tolerance:g} m and standing'
+                f'{passed:g} s after the goal was published {self.where(goal)}; allowed: '
+                f'within {required.tolerance:g} m and standing, within {required.within:g} s'
             )
         return super().check()
 

@@ -13,7 +13,9 @@ from pathlib import Path
 import pytest
 from forked_nodes import command, send, started_in_forks
 from rcl_interfaces.srv import SetParameters
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 
@@ -149,6 +151,53 @@ def test_messages_that_do_not_fit_into_the_queue_of_a_socket_are_an_error(monkey
             for _ in range(3):
                 world.publish(f'{name}/in', String(data='x' * 700_000))
             world.finish()
+        # What was lost is sent again meanwhile, and may be lost again.
+        world.close()
+
+
+RECREATES = """
+import rclpy
+from std_msgs.msg import Float64
+rclpy.init()
+for _ in range(3):
+    node = rclpy.create_node('anew')
+    node.create_subscription(Float64, 'in', print, 10)
+    for _ in range(20):
+        rclpy.spin_once(node)
+    node.destroy_node()
+"""
+
+
+def test_a_process_that_creates_its_node_anew_is_named(lockstep):
+    lockstep.start([sys.executable, '-c', RECREATES])
+    with fails(r'(?s)/anew was destroyed, or created anew, while .* runs: what is sent meanwhile'):
+        lockstep.run_for(2.0)
+
+
+DEADLINE = """
+import rclpy
+from rclpy.duration import Duration
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Float64
+rclpy.init()
+node = rclpy.create_node('strict')
+node.create_subscription(Float64, 'in', print, QoSProfile(depth=1, deadline=Duration(seconds=0.5)))
+rclpy.spin(node)
+"""
+
+
+def test_a_deadline_in_a_process_is_warned_of(lockstep):
+    with pytest.warns(UserWarning, match='subscription of /in of node /strict has a deadline of 0.5 s'):
+        process = lockstep.start([sys.executable, '-u', '-c', DEADLINE])
+    # As in ROS, only a publisher that promises as much reaches it.
+    with fails('/strict with .* deadline 0.5 s, and published with reliable, volatile, which does not'):
+        lockstep.publish('in', Float64(data=1.0))
+    profile = QoSProfile(depth=1, deadline=Duration(seconds=0.5))
+    publisher = lockstep.node.create_publisher(Float64, 'in', profile)
+    publisher.publish(Float64(data=2.0))
+    with pytest.warns(UserWarning, match='publisher of /in of node /lockstep has a deadline of 0.5 s'):
+        lockstep.settle()
+    assert 'data=2.0' in process.stdout
 
 
 def test_a_process_that_ends_while_driving_is_quoted(lockstep):

@@ -12,6 +12,7 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
@@ -83,6 +84,31 @@ def test_timers_on_a_wall_clock_run_on_wall_time(lockstep):
     while len(ticks) == before and time.monotonic() < deadline:
         lockstep.step(at_most=0.001)
     assert len(ticks) > before
+
+
+def test_limits_of_a_quality_of_service_run_on_wall_time(lockstep):
+    limits = QoSProfile(depth=1, deadline=Duration(seconds=0.1), lifespan=Duration(seconds=2.0))
+    lockstep.node.create_publisher(Vector3, 'stale', limits)
+    lockstep.node.create_publisher(Vector3, 'plain', 10)
+    with pytest.warns(UserWarning, match='which DDS measures on wall time') as warned:
+        lockstep.run_for(1.0)
+    assert [str(one.message).partition(', ')[0] for one in warned] == [
+        'the publisher of /stale of node /lockstep has a deadline of 0.1 s',
+        'the publisher of /stale of node /lockstep has a lifespan of 2 s',
+    ]
+    # Once.
+    lockstep.node.create_publisher(Vector3, 'other', 10)
+    lockstep.run_for(1.0)
+
+
+def test_a_node_that_was_created_but_not_added_is_named(lockstep):
+    idle, forgotten = Node('idle'), Blinker('forgotten')
+    with pytest.warns(UserWarning, match='node /forgotten was created, but not added') as warned:
+        lockstep.run_for(1.0)
+    assert len(warned) == 1
+    lockstep.run_until(lambda: True, 1.0)
+    for node in (idle, forgotten):
+        node.destroy_node()
 
 
 # --- Advancing

@@ -155,6 +155,15 @@ def test_a_goal_that_a_path_replaced_is_not_due_any_longer(with_paths, required)
     with_paths.finish()
 
 
+def test_a_robot_that_stands_at_the_goal_too_late_is_said_to(lockstep, scene):
+    lockstep.require(ReachesGoal(1.5))
+    scene.send(goal_at(1.0))
+    lockstep.node.create_timer(1.75, lambda: scene.send(odometry_at(1.0)))
+    words = 'the robot stood at the goal 1.75 s after it was published; allowed: 1.5 s'
+    with pytest.raises(PropertyViolation, match=words):
+        lockstep.run_for(2.0)
+
+
 @pytest.mark.parametrize('required', [KeepsDriving, ArrivesOnceFaultsEnd])
 def test_the_end_of_a_path_is_a_goal_of_its_controller(with_paths, required):
     with_paths.require(required(20.0))

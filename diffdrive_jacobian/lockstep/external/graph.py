@@ -7,25 +7,60 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
+from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._wall_time import INFINITE
 from diffdrive_jacobian.messages.names import full_name, node_of
+from diffdrive_jacobian.messages.topics import OF_EVERY_NODE, PARAMETER_EVENTS
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """Name of a node whose endpoints have been discovered before its name."""
-OF_EVERY_PROCESS = ('/rosout', '/parameter_events')
-"""Topics that stay within a process."""
 CLOCK_TYPE = 'rosgraph_msgs/msg/Clock'
 DESCRIPTIONS = 'type_description_interfaces/'
 """Package of the type of a service that every node has, and that only tools call."""
-Quality = tuple[ReliabilityPolicy, DurabilityPolicy]
 APART = 'lockstep'
 """Namespace, below the name of a node, of the topics that only this node of its process has."""
 PID = slice(4, 6)
 """Bytes of a GID of Fast DDS with the lower half of the number of its process."""
+
+
+class Quality(NamedTuple):
+    """What decides whether two ends of a topic match."""
+
+    reliability: ReliabilityPolicy
+    durability: DurabilityPolicy
+    deadline: int
+    """Longest period between two messages (ns)."""
+    liveliness: LivelinessPolicy
+    lease: int
+    """Lease duration of the liveliness (ns)."""
+
+    def __str__(self) -> str:
+        """Return the policies, and the durations that have a limit."""
+        limits = (('deadline', self.deadline), ('lease duration', self.lease))
+        return ' and '.join(
+            [
+                self.reliability.name,
+                self.durability.name,
+                *(f'{name} {limit / NANOSECONDS:g} s' for name, limit in limits if limit < INFINITE),
+            ]
+        )
+
+    def profile(self, depth: int) -> QoSProfile:
+        """Return the profile with a depth, which the graph does not show."""
+        return QoSProfile(
+            depth=depth,
+            reliability=self.reliability,
+            durability=self.durability,
+            deadline=Duration(nanoseconds=self.deadline),
+            liveliness=self.liveliness,
+            liveliness_lease_duration=Duration(nanoseconds=self.lease),
+        )
 
 
 class NodeGraph(NamedTuple):
@@ -82,7 +117,8 @@ def nodes_beside(node: Node) -> list[NodeGraph]:
             )
         ]
         for topics in parts[:2]:
-            for topic in OF_EVERY_PROCESS:
+            # They stay within the process.
+            for topic in OF_EVERY_NODE:
                 topics.pop(topic, None)
         for services in parts[2:]:
             for service in [one for one, kind in services.items() if kind.startswith(DESCRIPTIONS)]:
@@ -91,17 +127,28 @@ def nodes_beside(node: Node) -> list[NodeGraph]:
     return found
 
 
+def marks(node: Node) -> dict[str, bytes]:
+    """Return for the nodes in the domain of a node an id that differs if they are created anew.
+
+    It is that of the publisher of parameter events, which a node has from its beginning to its end.
+    """
+    found = node.get_publishers_info_by_topic(PARAMETER_EVENTS)
+    return {node_of(info): bytes(info.endpoint_gid) for info in found}
+
+
 def qualities_of(infos: Iterable[TopicEndpointInfo], node: str) -> set[Quality]:
-    """Return the reliability and durability of the endpoints of a node. Others run on wall time."""
+    """Return the qualities of service of the endpoints of a node. Lifespans run on wall time."""
     profiles = [info.qos_profile for info in infos if node_of(info) == node]
-    return {(profile.reliability, profile.durability) for profile in profiles}
-
-
-def reliable(profile: QoSProfile) -> QoSProfile:
-    """Return a profile that loses nothing on its way to subscriptions with this one."""
-    return QoSProfile(
-        depth=profile.depth, reliability=ReliabilityPolicy.RELIABLE, durability=profile.durability
-    )
+    return {
+        Quality(
+            profile.reliability,
+            profile.durability,
+            profile.deadline.nanoseconds,
+            profile.liveliness,
+            profile.liveliness_lease_duration.nanoseconds,
+        )
+        for profile in profiles
+    }
 
 
 def import_type(name: str, used_by: str) -> Any:

@@ -63,6 +63,8 @@ from diffdrive_jacobian.ros.runner import DISCOVERY, environment, ros_context
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
 
+__tracebackhide__ = True
+
 PERIOD = 0.01
 """Period at which the graph is looked at while a process starts (s)."""
 REPETITION = 1.0
@@ -229,6 +231,8 @@ class NodeProcess:
         self._sent: dict[str, list[bytes]] = {}
         self._clock_publishers: dict[str, Publisher] = {}
         self._clock_owners: dict[str, StandIn] = {}
+        self._marks: dict[str, bytes] = {}
+        """What differs if a node is created anew."""
         self._participants: set[int] = set()
         self._called: dict[str, tuple[str, StandIn]] = {}
         self._services_changed = True
@@ -497,6 +501,7 @@ class NodeProcess:
         self._quiet.learn()
         for pid in self._participants:
             self._datagrams.watch(pid)
+        self._marks = graphs.marks(self._outside)
         self._warn()
 
     def _warn(self) -> None:
@@ -616,14 +621,14 @@ class NodeProcess:
         """
         known = self._qualities.setdefault((role, topic), set())
         known |= set(qualities)
-        ((reliability, durability), *others) = known
+        (quality, *others) = known
         if others:
-            found = sorted(f'{one.name} and {other.name}' for one, other in known)
             raise LockstepError(
                 f'{self.child.title} uses {topic} with several qualities of service, at once or one '
-                f'after the other: {", ".join(found)}; a process may use one for each topic'
+                f'after the other: {", ".join(sorted(map(str, known)))}; a process may use one for each '
+                'topic'
             )
-        return QoSProfile(depth=depth, reliability=reliability, durability=durability)
+        return quality.profile(depth)
 
     def _relay(
         self, role: int, name: str, kind: str, node: StandIn, create: Callable[..., Relay], *args: Any
@@ -733,6 +738,25 @@ class NodeProcess:
         }
         return sorted(self._stand_ins.keys() - timed) if self._command.use_sim_time else []
 
+    def _check_present(self) -> None:
+        """Check that the nodes of a process that runs are those that were there before.
+
+        Raises:
+            LockstepError: They are not, or do not follow simulated time any more.
+        """
+        there = {graph.full_name for graph in graphs.nodes_beside(self._outside)}
+        marks = graphs.marks(self._outside)
+        anew = {name for name, mark in self._marks.items() if marks.get(name, mark) != mark}
+        if gone := sorted(name for name in self._stand_ins if name in anew or name not in there):
+            raise LockstepError(
+                f'{", ".join(gone)} was destroyed, or created anew, while {self.child.title} runs: what '
+                'is sent meanwhile would be lost or not, from run to run. In lockstep a process keeps '
+                'its nodes until it ends; Kill, or stop() and start(), create them anew'
+            )
+        if untimed := self._untimed():
+            raise LockstepError(f'{", ".join(untimed)} has stopped to follow simulated time')
+        self._marks = marks
+
     def _not_discovered(self) -> str:
         waited = f'within {self._command.timeout:g} s (timeout=)'
         missing = [name for (_, name), relay in self._relays.items() if not relay.is_matched()]
@@ -830,8 +854,7 @@ class NodeProcess:
         self._learn()
         self._share_topics()
         self._check_order()
-        if untimed := self._untimed():
-            raise LockstepError(f'{", ".join(untimed)} has stopped to follow simulated time')
+        self._check_present()
         if len(self._relays) > known:
             self._connect()
             self._add_nodes()

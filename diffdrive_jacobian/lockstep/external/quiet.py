@@ -359,8 +359,8 @@ class Quiet:
         if self._places is None or thread.own:
             return False
         if thread.tid not in self._depths:
-            # A new thread, as an executor starts them for callbacks.
-            return True
+            # A new thread, as an executor starts them for callbacks, and DDS for a new participant.
+            return not thread.read('comm').startswith('dds.')
         if int(arguments[-2], 16) < self._depths[thread.tid] - DEEPER:
             return True
         if thread.tid in self._polling:

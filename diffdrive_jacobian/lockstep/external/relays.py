@@ -7,6 +7,7 @@ world for the one of the process (`inside`). Messages pass as bytes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,7 +21,6 @@ from rclpy.task import Future
 
 from diffdrive_jacobian.lockstep._errors import LockstepError, one_type_per_topic
 from diffdrive_jacobian.lockstep._link import is_latched
-from diffdrive_jacobian.lockstep.external.graph import reliable
 from diffdrive_jacobian.ros.rclpy_internals import (
     lost_messages,
     message_taker,
@@ -151,7 +151,10 @@ def to_topic(
         sent: Receives what is sent.
         patience: Longest time until a message has arrived (s).
     """
-    publisher = outside.create_publisher(kind, name, reliable(profile))
+    offered = copy(profile)
+    # So it loses nothing.
+    offered.reliability = ReliabilityPolicy.RELIABLE
+    publisher = outside.create_publisher(kind, name, offered)
     send_raw = raw_sender(publisher)
 
     def send(data: bytes) -> None:
