@@ -6,15 +6,21 @@ This module imports nothing slow, so that an entry point can catch signals befor
 from __future__ import annotations
 
 import math
-import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import TYPE_CHECKING
 
-CAUGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+if TYPE_CHECKING:
+    from socket import socket
+
+CAUGHT = tuple(
+    getattr(signal, name) for name in ('SIGINT', 'SIGTERM', 'SIGHUP') if hasattr(signal, name)
+)
+"""Windows has no SIGHUP."""
 TOGETHER = 0.1
 """Signals this soon after the first are the same request, as from a terminal and a parent (s)."""
 GRACE = 2.0
@@ -85,31 +91,36 @@ class Signals:
         Args:
             end: Ends the process (`os._exit`); called from the thread.
         """
-        reader, writer = os.pipe()
-        os.set_blocking(writer, False)
-        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        # Slow to import. No pipe, because Windows needs a socket.
+        import socket
+
+        reader, writer = socket.socketpair()
+        writer.setblocking(False)
+        # Not closed.
+        signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
         # What was caught before is not in the pipe.
         watch = threading.Thread(
             target=self._watch, args=(reader, self._count > 0, end), name='signals', daemon=True
         )
         watch.start()
 
-    def _watch(self, reader: int, requested: bool, end: Callable[[], object]) -> None:
-        first = time.monotonic() if requested else None
-        while True:
-            if os.read(reader, 1)[0] not in CAUGHT:
-                continue
-            now = time.monotonic()
-            if first is None:
-                first = now
-            elif now - first >= TOGETHER:
-                break
-        while not self._ignored:
-            left = min(max(now, self._read) + GRACE, now + MAX_GRACE) - time.monotonic()
-            if left <= 0.0:
-                end()
-                return
-            time.sleep(min(left, 0.1))
+    def _watch(self, reader: socket, requested: bool, end: Callable[[], object]) -> None:
+        with reader:
+            first = time.monotonic() if requested else None
+            while True:
+                if reader.recv(1)[0] not in CAUGHT:
+                    continue
+                now = time.monotonic()
+                if first is None:
+                    first = now
+                elif now - first >= TOGETHER:
+                    break
+            while not self._ignored:
+                left = min(max(now, self._read) + GRACE, now + MAX_GRACE) - time.monotonic()
+                if left <= 0.0:
+                    end()
+                    return
+                time.sleep(min(left, 0.1))
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._count += 1

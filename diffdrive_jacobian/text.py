@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
+import os
+import sys
+
 PATH_LIMIT = 4096
 """Length that every path of Linux has room in: a `limit` for paths."""
 _ELLIPSIS = '...'
+
+
+def how_to_get_ros() -> str:
+    """Return where this machine gets ROS from, in words."""
+    if sys.platform == 'linux' and os.uname().machine == 'x86_64':
+        return (
+            'source the setup file of a ROS 2 Jazzy installation (. /opt/ros/jazzy/setup.bash), or call '
+            "pip install '.[jazzy]' in a clone of diffdrive_jacobian"
+        )
+    return (
+        'source a ROS 2 Jazzy installation (pip has ROS for Linux on x86-64 alone): of the system, in a '
+        'container, from RoboStack, or on Windows in WSL, see doc/troubleshooting.md'
+    )
 
 
 def printable(text: object, limit: int = 80) -> str:

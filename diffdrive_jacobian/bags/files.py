@@ -5,20 +5,19 @@ A bag is written in a hidden directory beside it, until it is complete and gets 
 
 from __future__ import annotations
 
-import fcntl
 import glob
-import os
 import re
 import shutil
 import stat
 import tempfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.locks import locked_directory
 
 REPLACED = 'replaced'
 """Name of the bag that is replaced, while the new one takes its place."""
@@ -49,15 +48,11 @@ def scratch_directory(target: Path) -> Iterator[Path]:
     """
     _remove_remains(target)
     scratch = Path(tempfile.mkdtemp(prefix=scratch_prefix(target), dir=target.parent))
-    descriptor = os.open(scratch, os.O_RDONLY)
-    try:
-        # The lock ends with the process, also if that is killed. Some file systems have no locks.
-        with suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield scratch
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-        os.close(descriptor)
+    with locked_directory(scratch, wait=True):
+        try:
+            yield scratch
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _remove_remains(target: Path) -> None:
@@ -69,14 +64,9 @@ def _remove_remains(target: Path) -> None:
         # Without the bag it may be about to be locked.
         if path.is_symlink() or not (path / target.name).is_dir() or (path / REPLACED).exists():
             continue
-        # It may belong to another user, or its process may just remove it.
-        with suppress(OSError):
-            descriptor = os.open(path, os.O_RDONLY)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with locked_directory(path) as ended:
+            if ended:
                 shutil.rmtree(path, ignore_errors=True)
-            finally:
-                os.close(descriptor)
 
 
 class NotARegularFileError(DiffdriveError, OSError):

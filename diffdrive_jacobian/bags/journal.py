@@ -11,11 +11,9 @@ which have checksums of their own.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import threading
 import zlib
-from contextlib import suppress
 from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
@@ -29,6 +27,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags.files import MCAP_MAGIC
+from diffdrive_jacobian.locks import lock
 
 PARAMETERS = 'parameters of '
 """Followed by a node's name, the key of the custom data that holds its parameters as JSON."""
@@ -143,9 +142,7 @@ class JournalWriter:
         self.path = path
         # Unbuffered: the buffer of `open` would raise again when it is closed after a failed write.
         self._file = open(path, 'x+b', buffering=0)  # noqa: SIM115
-        # The lock ends with the process, also if that is killed. Some file systems have no locks.
-        with suppress(OSError):
-            fcntl.flock(self._file, fcntl.LOCK_EX)
+        lock(self._file, wait=True)
         self._lock = threading.Lock()
         # Records that cannot be in a chunk.
         self._records = [MCAP_MAGIC + packed(Header(profile='ros2', library=LIBRARY))]
@@ -254,11 +251,4 @@ class JournalWriter:
 def is_being_written(path: Path) -> bool:
     """Return whether the process that writes a journal is still running, as far as it has a lock."""
     with open(path, 'rb') as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        except OSError:
-            # The file system has no locks.
-            return False
-    return False
+        return lock(file, shared=True) is False

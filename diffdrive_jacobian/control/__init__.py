@@ -15,9 +15,17 @@ from diffdrive_jacobian.control.controllers import (
     Controllers,
     controller_names,
     find_controller,
+    find_path_controller,
+    path_controller_names,
 )
 from diffdrive_jacobian.control.goal_laws import go_to_goal, go_to_pose, offset_point, turn_in_place
 from diffdrive_jacobian.control.path import Path, Reference
+from diffdrive_jacobian.control.path_laws import (
+    dynamic_feedback_linearization,
+    kanayama,
+    offset_point_tracking,
+    pure_pursuit,
+)
 from diffdrive_jacobian.control.path_source import (
     PathError,
     circle_path,
@@ -49,13 +57,19 @@ __all__ = [
     'Waypoints',
     'circle_path',
     'controller_names',
+    'dynamic_feedback_linearization',
     'figure_eight_path',
     'find_controller',
+    'find_path_controller',
     'go_to_goal',
     'go_to_pose',
+    'kanayama',
     'line_path',
     'offset_point',
+    'offset_point_tracking',
+    'path_controller_names',
     'planned_path',
+    'pure_pursuit',
     'resolved_rate',
     'saturate',
     'turn_in_place',

@@ -82,6 +82,10 @@ class AnyControllers(Collection[str], Generic[C]):
         """Return True: there are always the built-in ones."""
         return True
 
+    def hint(self, name: str) -> str:
+        """Return what a name is that is no controller of this kind. Empty: this is not known."""
+        return ''
+
     def find(self, name: str) -> C:
         """Return the controller of that name; an installed one is imported.
 
@@ -93,6 +97,7 @@ class AnyControllers(Collection[str], Generic[C]):
         if name not in self:
             raise ControllerError(
                 f'{self.parameter} must be one of {", ".join(map(repr, self))}, got {short(repr(name))}'
+                f'{self.hint(name)}'
             )
         return self._load(name)
 
@@ -144,6 +149,10 @@ class Controllers(AnyControllers[Controller]):
     parameter = 'controller'
     title = 'Control law'
 
+    def hint(self, name: str) -> str:
+        """Return what a name is that is no controller of goals."""
+        return ', a law of paths' if name in ALL_PATH_CONTROLLERS else ''
+
 
 class PathControllers(AnyControllers[PathController]):
     """Names of the controllers of paths, as `Controllers` of those of goals."""
@@ -153,6 +162,10 @@ class PathControllers(AnyControllers[PathController]):
     group = 'diffdrive_jacobian.path_controllers'
     parameter = 'path_controller'
     title = 'Control law along a path'
+
+    def hint(self, name: str) -> str:
+        """Return what a name is that is no controller of paths."""
+        return ', a law of goals' if name in CONTROLLERS else ''
 
 
 CONTROLLERS = Controllers()
@@ -172,6 +185,16 @@ def find_controller(name: str) -> Controller:
 def controller_names() -> tuple[str, ...]:
     """Return the names of the built-in and the installed controllers, sorted. Nothing is imported."""
     return tuple(CONTROLLERS)
+
+
+def find_path_controller(name: str) -> PathController:
+    """Return the controller of paths of that name, as `find_controller` one of goals."""
+    return ALL_PATH_CONTROLLERS.find(name)
+
+
+def path_controller_names() -> tuple[str, ...]:
+    """Return the names of the built-in and the installed controllers of paths, sorted."""
+    return tuple(ALL_PATH_CONTROLLERS)
 
 
 _loaded: dict[tuple[str, str], ControlLaw] = {}

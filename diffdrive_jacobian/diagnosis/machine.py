@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import importlib.util
 import os
 import platform
@@ -15,7 +14,8 @@ from pathlib import Path
 
 from diffdrive_jacobian import __version__
 from diffdrive_jacobian.diagnosis.graph import Problem
-from diffdrive_jacobian.text import format_size, printable
+from diffdrive_jacobian.locks import lock
+from diffdrive_jacobian.text import format_size, how_to_get_ros, printable
 
 DISTRIBUTION = 'jazzy'
 """The ROS distribution that this package is made for."""
@@ -133,8 +133,7 @@ def _check_versions(found: Environment) -> Iterator[Problem]:
     if missing:
         yield Problem(
             f'there is no {", ".join(missing)}',
-            f'source the setup file of a ROS installation (. /opt/ros/{DISTRIBUTION}/setup.bash), or '
-            f'call {install}',
+            how_to_get_ros(),
         )
     by_source = {
         source: sorted(n for n, s in found.sources.items() if s == source)
@@ -252,16 +251,16 @@ def shared_memory(path: Path = SHARED_MEMORY) -> SharedMemory | None:
     )
 
 
-def _stale_segments(path: Path) -> Iterator[int]:
+def _stale_segments(folder: Path) -> Iterator[int]:
     """Yield the sizes of the segments of Fast DDS whose process has ended (bytes).
 
     Each segment has a file with `_el` at its end, which a living process keeps locked.
     """
     with suppress(OSError):
-        for lock in path.glob('fastrtps_*_el'):
-            with suppress(OSError), lock.open('rb') as file:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-                yield lock.with_name(lock.name.removesuffix('_el')).stat().st_size
+        for path in folder.glob('fastrtps_*_el'):
+            with suppress(OSError), path.open('rb') as file:
+                if lock(file, shared=True):
+                    yield path.with_name(path.name.removesuffix('_el')).stat().st_size
 
 
 def check_shared_memory(memory: SharedMemory | None) -> Iterator[Problem]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.controller import Controller, Law
+from diffdrive_jacobian.control.controllers import find_controller
 from diffdrive_jacobian.control.goal_laws import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
@@ -58,7 +59,7 @@ class Batch:
 
     def __init__(
         self,
-        law: Law | Controller,
+        law: Law | Controller | str,
         starts: ArrayLike,
         goals: ArrayLike,
         gains: tuple[ArrayLike, ...],
@@ -73,6 +74,8 @@ class Batch:
     ) -> None:
         # What the law remembers at the start.
         self.state: tuple[float, ...] = ()
+        if isinstance(law, str):
+            law = find_controller(law)
         if isinstance(law, Controller):
             self.state, law = law.state, law.law
         self.law: Law = function('law', law)

@@ -46,7 +46,7 @@ class Trajectories(NamedTuple):
 
 
 def closed_loops(
-    law: Law | Controller,
+    law: Law | Controller | str,
     starts: ArrayLike,
     goals: ArrayLike,
     *gains: ArrayLike,
@@ -64,7 +64,8 @@ def closed_loops(
     """Drive every robot to its goal and return the outcomes. Memory does not grow with the duration.
 
     Args:
-        law: The control law, `law(poses, goals, *gains)`, or a `Controller`.
+        law: The control law, `law(poses, goals, *gains)`, or a `Controller`, or its name, one of
+            `control.controller_names()`.
         starts: Poses, shape (..., 3).
         goals: Positions or poses, shape (..., 2) or (..., 3), as the law requires.
         gains: Further arguments of the law, each of shape (...).
@@ -101,7 +102,7 @@ def closed_loops(
 
 
 def trajectories(
-    law: Law | Controller,
+    law: Law | Controller | str,
     starts: ArrayLike,
     goals: ArrayLike,
     *gains: ArrayLike,

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controller import PathController
-from diffdrive_jacobian.control.controllers import find_controller
+from diffdrive_jacobian.control.controllers import find_controller, find_path_controller
 from diffdrive_jacobian.control.path import Path
 from diffdrive_jacobian.control.path_following import PathFollower, PathSettings
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
@@ -234,7 +234,7 @@ class PathTracking(NamedTuple):
 
 
 def follow_path(
-    controller: PathController,
+    controller: PathController | str,
     path: Path,
     *,
     gains: Mapping[str, float] | None = None,
@@ -248,7 +248,7 @@ def follow_path(
     """Let a robot follow a path by a control law.
 
     Args:
-        controller: The law of the path.
+        controller: The law of the path, or its name, one of `control.path_controller_names()`.
         path: The path or trajectory.
         gains: Values of gains of the law, by name; None: their defaults.
         start: Pose of the robot, shape (3,); None: on the start of the path, along it.
@@ -262,6 +262,8 @@ def follow_path(
     Raises:
         ValueError: An argument is invalid, or the law fails.
     """
+    if isinstance(controller, str):
+        controller = find_path_controller(controller)
     instance('controller', controller, PathController)
     instance('path', path, Path)
     gains = gains or {}

@@ -278,8 +278,17 @@ class Parser(argparse.ArgumentParser):
         text = 'circle:RADIUS, line:LENGTH or eight:SIZE (m), or a .csv or .yaml file of poses'
         self.add_argument(name, metavar='PATH', help=f'{what}{text}')
 
+    def add_trajectory(self, name: str = '--trajectory') -> None:
+        """Add the option for a trajectory of constant speed along the path, which `given_path` reads."""
+        self.add_value(
+            name,
+            'M/S',
+            'drive the path as a trajectory of this constant speed: each pose has its time, which the '
+            'robot keeps (m/s) (default: a path without times)',
+        )
+
     def given_path(self, options: argparse.Namespace) -> PlannedPath:
-        """Return the path that was given; a trajectory has no `--speed`."""
+        """Return the path that was given, with the times of `--trajectory`."""
         # Not above: --help needs no NumPy.
         from diffdrive_jacobian.control.path_source import PathError, planned_path
 
@@ -289,9 +298,12 @@ class Parser(argparse.ArgumentParser):
             self.error(str(error))
         if len(path.poses) > MAX_PATH_POSES:
             self.error(f'a path must have at most {MAX_PATH_POSES} poses, got {len(path.poses)}')
-        if path.times is not None and options.speed is not None:
-            self.error(f'--speed has no effect on the trajectory {options.path}, whose poses have times')
-        return path
+        for option in ('--speed', '--trajectory'):
+            if path.times is not None and getattr(options, option[2:], None) is not None:
+                self.error(
+                    f'{option} has no effect on the trajectory {options.path}, whose poses have times'
+                )
+        return path if options.trajectory is None else path.timed(options.trajectory)
 
     def add_heading(self, text: str) -> None:
         """Add the options for a heading, which `given_heading` evaluates."""

@@ -67,6 +67,11 @@ def counted(number: int, noun: str) -> str:
     return f'{number} {noun}' if number == 1 else f'{number} {noun}s'
 
 
+def deviation(metres: float) -> str:
+    """Return a distance from a path, which may be a fraction of a millimetre."""
+    return f'{1e3 * metres:.2f} mm' if metres < 0.1 else f'{metres:.3f} m'
+
+
 def describe_bag(bag: Path, summary: Summary, state: str = 'complete') -> str:
     """Return one line about the content of a bag."""
     what = f'{printable(bag, PATH_LIMIT)} is {state}'

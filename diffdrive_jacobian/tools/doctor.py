@@ -17,7 +17,7 @@ from diffdrive_jacobian.diagnosis.machine import (
 )
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.text import how_to_get_ros, printable
 from diffdrive_jacobian.tools import _cli, _output
 from diffdrive_jacobian.tools._output import counted
 from diffdrive_jacobian.tools.entry_points import DONE, FAILED, INTERRUPTED, long_lived
@@ -25,7 +25,6 @@ from diffdrive_jacobian.tools.entry_points import DONE, FAILED, INTERRUPTED, lon
 PROGRAM = 'doctor'
 DISCOVERY = 3.5
 """Time within which every node is discovered (s): an older participant is announced every 3 s."""
-INSTALL = "source a ROS installation, or pip install '.[jazzy]' in a clone of diffdrive_jacobian"
 MAX_LISTED = 100
 """Number of nodes and of topics that are listed."""
 
@@ -63,7 +62,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             return _output.complain(PROGRAM, error)
         except (ImportError, OSError, RuntimeError) as error:
             why = printable(' '.join(str(error).split()), 300)
-            findings.append(Problem(f'ROS cannot be used: {why}', INSTALL))
+            findings.append(Problem(f'ROS cannot be used: {why}', how_to_get_ros()))
     findings += [*check_topics(graph), *check_clocks(graph)]
     if signals.count:
         return INTERRUPTED

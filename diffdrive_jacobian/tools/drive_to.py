@@ -102,11 +102,12 @@ def _check(parser: _cli.Parser, options: argparse.Namespace) -> None:
     if len(options.coordinates) % 2:
         parser.error(f'coordinates must be pairs X Y, got {len(options.coordinates)} of them')
     if options.path is None:
-        for option in ('--speed', '--path-controller'):
+        for option in ('--speed', '--trajectory', '--path-controller'):
             parser.refuse_without(options, option, '--path')
     elif options.coordinates or options.heading is not None:
         parser.error('--path excludes X Y and --heading')
-    for option in ('--output', '--force'):
+    parser.refuse_with(options, '--speed', '--trajectory')
+    for option in ('--output', '--force', '--no-plot'):
         parser.refuse_with(options, option, '--no-record')
     parser.refuse_without(options, '--force', '--output')
     if options.lockstep and options.open:
@@ -232,7 +233,7 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
             side = 'from' if outcome.arrived else 'before'
             distances = f'{outcome.distance:.3f} m {side} the end of the path'
             if not math.isnan(outcome.across):
-                distances += f', after at most {outcome.across:.3f} m from it'
+                distances += f', after at most {_output.deviation(outcome.across)} from it'
             if not math.isnan(outcome.late):
                 distances += f', {outcome.late:.1f} s later than by its times'
             if not math.isnan(outcome.true_distance):
@@ -326,6 +327,7 @@ def _parser() -> _cli.Parser:
         'M/S',
         'speed along a path without times (m/s) (default: 0.2, unless a file sets it)',
     )
+    parser.add_trajectory()
     parser.add_argument(
         '--path-controller',
         choices=ALL_PATH_CONTROLLERS,

@@ -17,6 +17,7 @@ from functools import partial
 
 from diffdrive_jacobian.ros.fastdds_profiles import announce_frequently
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.text import how_to_get_ros
 
 DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done, not done, wrong arguments, interrupted by a signal."""
@@ -135,11 +136,7 @@ def _discard_output() -> None:
 def _remedy(module: str | None) -> str | None:
     """Return what to do about a Python module that is missing. None: it can only be a defect."""
     if module in ROS_MODULES:
-        return (
-            f'ROS 2 is not available, there is no Python module {module}: source the setup file of a '
-            'ROS 2 Jazzy installation (. /opt/ros/jazzy/setup.bash), or call '
-            "pip install '.[jazzy]' in a clone of diffdrive_jacobian"
-        )
+        return f'ROS 2 is not available, there is no Python module {module}: {how_to_get_ros()}'
     if module in BAG_MODULES:
         return f'there is no Python module {module}: call pip install rosbags mcap'
     return None
@@ -148,7 +145,12 @@ def _remedy(module: str | None) -> str | None:
 def _exit(program: str, why: str) -> None:
     """End the process without clean-up, and print why."""
     error = sys.stderr.fileno()
-    # Whoever reads it may have stopped reading.
-    if select.select([], [error], [], 0.0)[1]:
+    try:
+        # Whoever reads it may have stopped reading.
+        writable = bool(select.select([], [error], [], 0.0)[1])
+    except OSError:
+        # Windows asks sockets alone.
+        writable = True
+    if writable:
         os.write(error, f'{program}: {why}\n'.encode())
     os._exit(INTERRUPTED)

@@ -118,7 +118,8 @@ def report(result: GoalResult, options: argparse.Namespace, what: str) -> list[s
     where = ''
     if result.across is not None:
         side = 'from' if result.arrived else 'before'
-        where = f', {result.distance:.3f} m {side} the end, at most {result.across:.3f} m from the path'
+        across = _output.deviation(result.across)
+        where = f', {result.distance:.3f} m {side} the end, at most {across} from the path'
         if result.late is not None:
             where += f', {result.late:.1f} s later than by its times'
     elif result.distance is not None and not result.topic.endswith('path'):

@@ -18,8 +18,6 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     options = parser.parse(arguments)
     parser.refuse_with(options, '--timeout', '--no-wait')
     path = parser.given_path(options)
-    if options.speed is not None:
-        path = path.timed(options.speed)
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.nodes.remote_goal import send_goal
@@ -38,10 +36,6 @@ def _parser() -> _cli.Parser:
         'arrived; 2: wrong arguments; 130: interrupted.',
     )
     parser.add_path('path')
-    parser.add_value(
-        '--speed',
-        'M/S',
-        'send a trajectory with this speed: poses with stamps (m/s) (default: a path without times)',
-    )
+    parser.add_trajectory()
     add_options(parser, 'path', 'path')
     return parser

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -75,16 +76,18 @@ def test_what_leaves_nothing_is_ended_at_once(when, code, printed):
 
 
 class Watched:
-    """A watch without a process: signals are bytes in a pipe."""
+    """A watch without a process: signals are bytes in a socket."""
 
     def __init__(self, monkeypatch, *, together=0.0, grace=0.0, max_grace=60.0):
         for name, value in (('TOGETHER', together), ('GRACE', grace), ('MAX_GRACE', max_grace)):
             monkeypatch.setattr(module, name, value)
         self.signals = Signals()
         self.ended = threading.Event()
-        self._reader, self._writer = os.pipe()
+        reader, writer = socket.socketpair()
+        # Not closed, as in `exit_on_second`.
+        self._writer = writer.detach()
         self._thread = threading.Thread(
-            target=self.signals._watch, args=(self._reader, False, self.ended.set), daemon=True
+            target=self.signals._watch, args=(reader, False, self.ended.set), daemon=True
         )
         self._thread.start()
 

@@ -111,6 +111,23 @@ def test_a_bag_is_watched_without_ros(ours):
     assert f'--port {port} is in use' in error_of('watch_run', ended)
 
 
+NO_POSIX = f"""
+import signal, sys
+del signal.SIGHUP
+sys.modules.pop('fcntl', None)
+{ABSENT.format(modules=(*ROS_MODULES, 'rpyutils', 'fcntl'))}
+"""
+
+
+def test_runs_are_drawn_and_verified_where_files_have_no_locks(tmp_path, ours):
+    """As on Windows, which has no SIGHUP either."""
+    calls = [('plot_run', ours, '-o', 'run.png'), ('verify_run', ours), ('recover_run', ours)]
+    ended = run_each(calls, NO_POSIX, modules=forked.LIBRARIES, cwd=tmp_path)
+    assert [(one.code, one.err) for one in ended[:2]] == 2 * [(0, '')]
+    assert (tmp_path / 'run.png').stat().st_size > 10_000
+    assert 'is complete: nothing to recover' in ended[2].err
+
+
 def test_other_missing_modules(tmp_path):
     """A ROS installation has no rosbags, which is needed in addition. Others are a defect."""
     calls = [(tool, REAL) for tool in ('plot_run', 'recover_run', 'replay_run', 'verify_run')]
