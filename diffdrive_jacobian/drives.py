@@ -232,7 +232,9 @@ def drive(
         raise ValueError('lockstep, isolated and ros_arguments are those of the runner, if one is given')
     if not isinstance(goals, Path):
         goals = np.asarray(goals, dtype=np.float64)
-        if goals.ndim != 2 or goals.shape[1] != 3:
+        if goals.ndim != 2 or goals.shape[1] not in (2, 3) or not len(goals):
+            raise ValueError(f'goals must have shape (n, 2) or (n, 3) with n > 0, got {goals.shape}')
+        if goals.shape[1] == 2:
             goals = waypoints_through(goals)
     sent, signals = goals, signals or Signals()
     with ExitStack() as stack:

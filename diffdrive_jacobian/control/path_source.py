@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.path import Path
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.numerics.checks import finite, number, positive
-from diffdrive_jacobian.numerics.fields import short
+from diffdrive_jacobian.numerics.checks import finite, number
+from diffdrive_jacobian.numerics.fields import between, short
 from diffdrive_jacobian.text import format_size, printable
 
 Floats = NDArray[np.float64]
@@ -36,6 +36,8 @@ SPACING = 0.05
 """Largest distance between the poses of a shape (m), that of common planners."""
 MOST, FEWEST = 5_000, 64
 """Number of poses of large and of small shapes."""
+LEAST_SIZE, GREATEST_SIZE = 1e-3, 1e5
+"""Sizes of shapes (m)."""
 COLUMNS = {
     **{'x': 'x', 'x_m': 'x', 'y': 'y', 'y_m': 'y', 'theta': 'theta', 'theta_rad': 'theta'},
     **{'t': 't', 'time': 't', 'time_s': 't'},
@@ -48,25 +50,29 @@ class PathError(DiffdriveError, ValueError):
     """A text is no path, or a file has none. The message says where and what is allowed."""
 
 
+def _check_size(name: str, size: float) -> None:
+    between(LEAST_SIZE, GREATEST_SIZE, unit='m')(name, size)
+
+
 def circle_path(radius: float) -> Path:
-    """Return a circle to the left, of a positive radius (m)."""
-    radius = number('radius', radius, positive)
+    """Return a circle to the left, of a radius in [0.001, 1e5] (m)."""
+    radius = number('radius', radius, _check_size)
     return _shape(lambda u: (radius * np.sin(u), radius * (1.0 - np.cos(u))), 2.0 * math.pi * radius)
 
 
 def line_path(length: float) -> Path:
-    """Return a straight line of a positive length (m)."""
-    length = number('length', length, positive)
+    """Return a straight line of a length in [0.001, 1e5] (m)."""
+    length = number('length', length, _check_size)
     return _shape(lambda u: (length * u / (2.0 * math.pi), 0.0 * u), length)
 
 
 def figure_eight_path(size: float) -> Path:
     """Return a figure eight, the lemniscate of Bernoulli, from one of its ends to the left.
 
-    With `c = a / (1 + sin(u)^2)` it is `x = c sin(u) cos(u), y = a - c cos(u)`. The size a is positive
+    With `c = a / (1 + sin(u)^2)` it is `x = c sin(u) cos(u), y = a - c cos(u)`. The size a is in [0.001, 1e5]
     (m): it is 2 a long in y, and narrowest at its ends, with the radius a/3.
     """
-    a = number('size', size, positive)
+    a = number('size', size, _check_size)
 
     def point(u: Floats) -> tuple[Floats, Floats]:
         c = a / (1.0 + np.sin(u) ** 2)
@@ -103,10 +109,11 @@ def planned_path(text: str) -> Path:
         raise PathError(f'{shape} needs its size (m), as in {shape}:1.0, got {short(text, repr)}')
     if shape in SHAPES:
         try:
-            return SHAPES[shape](number('size', float(size), positive))
+            return SHAPES[shape](number('size', float(size), _check_size))
         except ValueError:
             raise PathError(
-                f'size of a shape must be a positive number (m), got {short(text, repr)}'
+                f'size of a shape must be in [{LEAST_SIZE:g}, {GREATEST_SIZE:g}] m, got '
+                f'{short(text, repr)}'
             ) from None
     file = FilePath(text)
     read = _READERS.get(file.suffix.lower())

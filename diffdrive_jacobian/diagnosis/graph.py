@@ -12,6 +12,7 @@ from diffdrive_jacobian.messages.topics import (
     ALTERNATING,
     CLOCK,
     OF_EVERY_NODE,
+    OF_SOMEBODY_ELSE,
     SEVERAL,
     TOPICS,
     UNPUBLISHED,
@@ -83,6 +84,10 @@ class Endpoint:
     quality: Quality = Quality()
 
 
+WHEELS = ('wheel_radius', 'wheel_separation')
+"""Parameters with the dimensions for which wheel speeds are computed, and with which they are driven."""
+
+
 @dataclass(frozen=True, slots=True)
 class Participant:
     """A node."""
@@ -91,6 +96,36 @@ class Participant:
     """Fully qualified name."""
     use_sim_time: bool | None = None
     """None: it did not report it."""
+    wheels: tuple[float, ...] | None = None
+    """Values of its parameters WHEELS (m). None: it has none."""
+
+
+def different_wheels(computed: tuple[float, ...], name: str, driven: tuple[float, ...]) -> str:
+    """Return what a node does whose wheels differ from those for which its speeds are computed.
+
+    Empty: they are the same.
+
+    Args:
+        computed: The values of WHEELS for which the speeds are computed (m).
+        name: Name of the node that drives by the speeds.
+        driven: Its values of WHEELS (m).
+    """
+    differences = [
+        f'{what} {there:g} m instead of {here:g} m'
+        for what, here, there in zip(WHEELS, computed, driven, strict=True)
+        if here != there
+    ]
+    if not differences:
+        return ''
+    (r, L), (their_r, their_L) = computed, driven
+    return (
+        f'{name} has {" and ".join(differences)}, for which its wheel speeds are computed: it drives '
+        f'{their_r / r:.3g} times and turns {their_r / r * L / their_L:.3g} times as fast as commanded'
+    )
+
+
+SAME_WHEELS = 'give both nodes the same dimensions, as by the same --robot or --params-file'
+"""What to do about that."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -149,12 +184,14 @@ def check_topics(graph: Graph) -> Iterator[Problem]:
             yield Problem(
                 f'{count} nodes have the name {name}',
                 'stop one of them, or give each a name or a namespace of its own (-r __node:=NAME, '
-                '-r __ns:=/NAME); one that was killed disappears within 20 s',
+                f'-r __ns:=/NAME); one that was killed disappears within 20 s; {OF_SOMEBODY_ELSE}',
             )
     for topic in graph.topics():
         yield from _check_types(graph, topic)
         yield from _check_quality(graph, topic)
         yield from _check_ends(graph, topic)
+        if base_name(topic) == 'joint_command':
+            yield from _check_wheels(graph, topic)
 
 
 def _check_types(graph: Graph, topic: str) -> Iterator[Problem]:
@@ -245,6 +282,16 @@ def _check_ends(graph: Graph, topic: str) -> Iterator[Problem]:
                 # Tools that publish goals come and go.
                 problem=fault.problem and (fault is not UNREAD or known.name in COMMANDS),
             )
+
+
+def _check_wheels(graph: Graph, topic: str) -> Iterator[Problem]:
+    known = {node.name: node.wheels for node in graph.nodes if node.wheels is not None}
+    for source in graph.publishers(topic):
+        for sink in graph.subscriptions(topic):
+            if source.node in known and sink.node in known:
+                found = different_wheels(known[source.node], sink.node, known[sink.node])
+                if found:
+                    yield Problem(f'{found} by {source.node}', SAME_WHEELS)
 
 
 def _namesake(graph: Graph, topic: str, *, publishes: bool) -> str:

@@ -20,6 +20,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
 from diffdrive_jacobian.diagnosis.graph import (
+    WHEELS,
     ClockMessages,
     Endpoint,
     Graph,
@@ -32,6 +33,7 @@ from diffdrive_jacobian.messages.codecs import CLOCK as CLOCK_TIME
 from diffdrive_jacobian.messages.codecs import STAMP
 from diffdrive_jacobian.messages.names import full_name, node_of, type_name
 from diffdrive_jacobian.messages.topics import CLOCK
+from diffdrive_jacobian.nodes.same_wheels import wheels_of
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.ros.serialization import reader
 from diffdrive_jacobian.ros.service_client import ServiceClient, ignore
@@ -84,6 +86,7 @@ class Observer(Node):  # type: ignore[misc]
         self._received: dict[str, _Received] = {}
         self._simulated = _ClockReceived()
         self._use_sim_time: dict[str, bool] = {}
+        self._wheels: dict[str, tuple[float, ...]] = {}
         self._parameter_clients: dict[str, ServiceClient] = {}
         self._asked: set[str] = set()
         self.create_timer(PERIOD, self._look)
@@ -109,6 +112,9 @@ class Observer(Node):  # type: ignore[misc]
                 self._asked.add(name)
                 request = GetParameters.Request(names=['use_sim_time'])
                 client.call(request, partial(self._on_answer, name), ignore)
+                # Alone: rclcpp answers with nothing if one of several is not declared.
+                request = GetParameters.Request(names=[*WHEELS])
+                client.call(request, partial(self._on_wheels, name), ignore)
 
     def _subscribe(self, topic: str, kind: type) -> None:
         stamp = _stamp_reader(kind, STAMP) if kind in STAMPED else None
@@ -125,6 +131,11 @@ class Observer(Node):  # type: ignore[misc]
         # 1: PARAMETER_BOOL
         if len(values) == 1 and values[0].type == 1:
             self._use_sim_time[name] = values[0].bool_value
+
+    def _on_wheels(self, name: str, response: Any) -> None:
+        wheels = wheels_of(response)
+        if wheels is not None:
+            self._wheels[name] = wheels
 
     def _topics(self) -> list[tuple[str, list[str]]]:
         """Return the names and types of the topics.
@@ -158,7 +169,7 @@ class Observer(Node):  # type: ignore[misc]
         ]
         return Graph(
             nodes=tuple(
-                Participant(printable(name), self._use_sim_time.get(name))
+                Participant(printable(name), self._use_sim_time.get(name), self._wheels.get(name))
                 for name in self._names()
                 if '/_' not in name
             ),

@@ -284,6 +284,13 @@ class Selection:
     """Regular expression. Topics in whose full name it is found are recorded as well."""
 
 
+OF_SOMEBODY_ELSE = (
+    'one of somebody else, perhaps on another machine of this network, is not met with '
+    'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or with a ROS_DOMAIN_ID of your own'
+)
+"""What to do about a second node of the same name."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TopicFault:
     """A fault that a topic may have."""
@@ -313,7 +320,9 @@ class TopicFault:
             topic=topic,
             publishers=listed(publishers),
             remedy=self.remedy(known),
-            killed='; one that was killed disappears within 20 s' if repeated else '',
+            killed=f'; one that was killed disappears within 20 s; {OF_SOMEBODY_ELSE}'
+            if repeated
+            else '',
         )
 
     def found(self, topic: str, publishers: list[str], subscriptions: list[str]) -> str:

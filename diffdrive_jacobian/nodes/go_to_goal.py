@@ -34,7 +34,7 @@ from diffdrive_jacobian.messages.codecs import (
     Route,
 )
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_WAYPOINTS, MessageError
-from diffdrive_jacobian.messages.topics import SEVERAL, UNREAD
+from diffdrive_jacobian.messages.topics import OF_SOMEBODY_ELSE, SEVERAL, UNREAD
 from diffdrive_jacobian.nodes.other_drivers import PERIOD, OtherDrivers
 from diffdrive_jacobian.nodes.stopping import overshoot_warnings, rolls_on
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
@@ -348,6 +348,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._others.start()
         self._publish_status(goal.info, GoalStatus.STATUS_ACCEPTED)
         self.log_event_info('goal accepted', f'goal accepted: {described(goal)}')
+        self._advise_for(goal)
 
     def _match_frames(self, goal: Goal) -> None:
         if goal.frame and self._odom_frame and goal.frame != self._odom_frame:
@@ -564,11 +565,13 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     def _on_other_driver(self, names: str) -> None:
         """Cancel the goal: whoever drives by hand takes over."""
         # The zero of `_end`: or the robot might follow the last command of this node.
-        topic = self._cmd_vel.topic_name
+        topic, hint = self._cmd_vel.topic_name, ''
+        if self.get_fully_qualified_name() in names:
+            names, hint = f'another {names}', f'; {OF_SOMEBODY_ELSE}'
         self.log_event_warning(
             'other driver',
             f'{names} drives the robot by {topic}, so the goal is canceled: send it again later, or '
-            'remap the topic of the other one',
+            f'remap the topic of the other one{hint}',
         )
         self._end(GoalStatus.STATUS_CANCELED, 'canceled')
 
@@ -588,7 +591,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._configure()
         goal = self._goal
         if goal is None:
+            self._advise()
             return
+        self._advise_for(goal)
         if (self._controller, self._arrival.offset) != before:
             # The driven point or the law is another one.
             goal.waypoints = goal.waypoints.resumed()
@@ -602,8 +607,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         law = controller.bind(parameters)
         law.continue_from(self._law)
         self._law = law
-        path_controller = parameters.chosen_path_controller()
-        path_law = path_controller.bind(parameters)
+        path_law = parameters.chosen_path_controller().bind(parameters)
         path_law.continue_from(self._path_law)
         self._path_law, self._path_settings = path_law, parameters.path_settings()
         # Far from the goal a law may return more than what counts as a plausible command.
@@ -632,19 +636,35 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 f'the yaw rate is limited to {slowest:g} rad/s: half a turn takes more than '
                 f'{SLOW_TURN:g} s',
             )
-        self._warn_of_rate()
-        warnings = controller.warnings(parameters, self._limits)
-        warnings += path_controller.warnings(parameters, self._limits)
-        if not parameters.stop_in_time:
-            kv = parameters.kv if KV.name in controller.gain_names else None
-            turns = self._arrival.use_heading or KP.name in controller.gain_names
-            kp = parameters.kp if turns else None
-            warnings += overshoot_warnings(kv, kp, self._limits, self._actuators)
+        self._advised: set[str] = set()
+
+    def _advise(self, *, goals: bool = True, paths: bool = True) -> None:
+        """Warn of gains that do not suit, each once: of the law of goals, and of that of paths."""
+        parameters, controller, warnings = self.parameters, self._controller, list[str]()
+        if goals:
+            self._warn_of_rate()
+            warnings += controller.warnings(parameters, self._limits)
+            if not parameters.stop_in_time:
+                kv = parameters.kv if KV.name in controller.gain_names else None
+                turns = self._arrival.use_heading or KP.name in controller.gain_names
+                kp = parameters.kp if turns else None
+                warnings += overshoot_warnings(kv, kp, self._limits, self._actuators)
+        if paths:
+            warnings += parameters.chosen_path_controller().warnings(parameters, self._limits)
         for number, warning in enumerate(warnings):
-            self.log_event_warning(f'advice {number}', warning)
+            if warning not in self._advised:
+                self._advised.add(warning)
+                self.log_event_warning(f'advice {number}', warning)
+
+    def _advise_for(self, goal: Goal) -> None:
+        """Warn of gains that do not suit for a goal."""
+        passing = self.parameters.pass_waypoints and len(goal.waypoints.poses) > 1
+        self._advise(goals=goal.whole is None, paths=goal.whole is not None or passing)
 
     def _warn_of_rate(self) -> None:
-        """Warn of gains that are too large for the rate of the odometry."""
+        """Warn of gains that are too large for the rate of the odometry, unless a path is driven."""
+        if self._goal is not None and self._goal.whole is not None:
+            return
         for warning in self._controller.rate_warnings(
             self.parameters, self._rate, turns=self._arrival.use_heading
         ):

@@ -9,6 +9,7 @@ from geometry_msgs.msg import Twist, TwistStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from diffdrive_jacobian.diagnosis.graph import SAME_WHEELS
 from diffdrive_jacobian.messages.codecs import (
     JOINT_STATE,
     TWIST,
@@ -19,6 +20,7 @@ from diffdrive_jacobian.messages.codecs import (
 )
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.topics import UNREAD
+from diffdrive_jacobian.nodes.same_wheels import SameWheels
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
 from diffdrive_jacobian.ros.graph_faults import topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
@@ -52,6 +54,12 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             JointState if as_joints else Float64MultiArray, 'joint_command'
         )
         self._configure()
+        self._same_wheels: SameWheels | None = SameWheels(
+            self,
+            self._joint_command,
+            (parameters.wheel_radius, parameters.wheel_separation),
+            lambda found: self.get_logger().warning(f'{found}; {SAME_WHEELS}'),
+        )
         self._commands = Interleaving()
         stamped = parameters.enable_stamped_cmd_vel
         kind, self._codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
@@ -80,6 +88,8 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
             return
         self._watchdog.feed(now)
+        if self._same_wheels is not None and self._same_wheels.advance():
+            self._same_wheels = None
         if v or omega:
             self._commands.count()
             self.warn_of_integers('a command on cmd_vel', v, omega)

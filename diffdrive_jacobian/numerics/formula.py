@@ -113,7 +113,10 @@ def formula(signature: str, **checks: Check) -> _Decorator:
                 # `bind` takes longer than most equations.
                 args += (None,) * len(missing)
             else:
-                bound = described.bind(*args, **kwargs)
+                try:
+                    bound = described.bind(*args, **kwargs)
+                except TypeError as error:
+                    raise TypeError(f'{body.__name__}: {error}; it takes {given}') from None
                 bound.apply_defaults()
                 args = tuple(bound.arguments.values())
             batch: tuple[int, ...] = ()

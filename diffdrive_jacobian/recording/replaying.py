@@ -46,8 +46,8 @@ MAX_DURATION = 2**62
 """Longest playback (ns): 146 years, half of the longest period of a timer of rcl."""
 MAX_STAMP = 2**31 * NANOSECONDS
 """Limit of the times in messages (ns)."""
-CLOCK_RATES = (1e-9, 1e9)
-"""Lowest and highest rate of /clock (Hz). The period of a timer is a number of ns, of at least 1."""
+CLOCK_RATES = (1e-9, 1e4)
+"""Lowest and highest rate of /clock (Hz). A Python process publishes some thousand messages a second."""
 COMMANDS = ('cmd_vel',)
 """Topics of the commands to a robot."""
 GOALS = ('goal_pose', 'goals')

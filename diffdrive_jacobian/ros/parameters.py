@@ -98,33 +98,47 @@ def _program(node: Node) -> str:
     return ours[0].rpartition('.')[2] if ours else str(node.get_name())
 
 
-_files: WeakKeyDictionary[Context, list[str]] = WeakKeyDictionary()
-"""The parameter files of contexts."""
+_arguments: WeakKeyDictionary[Context, list[tuple[str, str]]] = WeakKeyDictionary()
+"""The ROS arguments of contexts, each with the one after it."""
 
 
-def use_files(context: Context, arguments: Sequence[str]) -> None:
-    """Note which parameter files the ROS arguments of a context name, for `report_unknown`."""
-    _files[context] = [path for flag, path in pairwise(arguments) if flag == '--params-file']
+def use_arguments(context: Context, arguments: Sequence[str]) -> None:
+    """Note the ROS arguments of a context, for `report_unknown`."""
+    _arguments[context] = [*pairwise(arguments)]
+
+
+def _given(context: Context) -> set[str]:
+    """Return the names of the parameters that were given by `-p`, as `NODE:NAME:=VALUE`, too."""
+    pairs = _arguments.get(context, ())
+    texts = [text for flag, text in pairs if flag in ('-p', '--param')]
+    return {text.partition(':=')[0].rpartition(':')[2] for text in texts}
 
 
 def _shared(context: Context) -> set[str]:
     """Return the names of the parameters that files give to nodes of any name, as under `/**`."""
     found: set[str] = set()
-    for path in _files.get(context, ()):
+    for path in (text for flag, text in _arguments.get(context, ()) if flag == '--params-file'):
         # What is wrong for rcl is an error before.
         with suppress(UserError):
             found.update(*(values for name, values in sections(path) if is_shared(name)))
     return found
 
 
-def report_unknown(nodes: Sequence[Node]) -> None:
-    """Log a warning for each parameter that the user gave and that no node of this process declares.
+def report_unknown(nodes: Sequence[Node], others: Iterable[Node] = ()) -> None:
+    """Report each parameter that the user gave and that no node of this process declares.
 
-    The nodes of a process share its command line, so one of them must declare the parameter. What a file
-    gives to nodes of any name may be for other processes, unless it resembles a parameter that is
-    declared.
+    The nodes of a process share its command line, so one of them must declare the parameter. One that is
+    given by a file is logged. What a file gives to nodes of any name may be for other processes, unless
+    it resembles a parameter that is declared.
+
+    Args:
+        nodes: The nodes of this package.
+        others: Further nodes, which may declare it.
+
+    Raises:
+        ParameterError: One was given by `-p`.
     """
-    declared = {name for node in nodes for name in declared_parameters(node)}
+    declared = {name for node in (*nodes, *others) for name in declared_parameters(node)}
     unknown: dict[str, Node] = {}
     for node in nodes:
         for name in parameter_overrides(node).keys() - declared:
@@ -140,12 +154,33 @@ def report_unknown(nodes: Sequence[Node]) -> None:
     known = sorted(name for name in declared if not name.startswith(PARAMETERS_OF_RCLPY))
     programs = sorted({f'{_program(node)} --help' for node in nodes})
     shared = set().union(*(_shared(node.context) for node in nodes))
+    given = set().union(*(_given(node.context) for node in nodes))
     for name, node in sorted(unknown.items()):
-        close = difflib.get_close_matches(name, known, n=1)
+        close = [one for one in known if one.lower() == name.lower()]
+        close = close or difflib.get_close_matches(name, known, n=1)
         if not close and len(name) <= SHORT:
             close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
         if name in shared and (name in ours or not close):
             continue
         hint = ' or '.join(f"'{one}'" for one in sorted(close))
         hint = f'did you mean {hint}?' if close else f'see {" or ".join(programs)}'
+        if name in given and name not in _later_gains():
+            raise ParameterError(f"no node of this program has the parameter '{name}'; {hint}")
         node.get_logger().warning(f"unknown parameter '{name}' is ignored; {hint}")
+
+
+def _later_gains() -> set[str]:
+    """Return the gains of all installed controllers, which are declared when one is chosen."""
+    # Slow to import.
+    from diffdrive_jacobian.control.controllers import (
+        ALL_PATH_CONTROLLERS,
+        CONTROLLERS,
+        ControllerError,
+    )
+
+    found: set[str] = set()
+    for controllers in (CONTROLLERS, ALL_PATH_CONTROLLERS):
+        for name in controllers:
+            with suppress(ControllerError):
+                found.update(controllers.find(name).gain_names)
+    return found

@@ -30,7 +30,7 @@ from diffdrive_jacobian.ros.fastdds_profiles import withdraw
 from diffdrive_jacobian.ros.guarded_executor import GuardedExecutor
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.node import ParameterizedNode
-from diffdrive_jacobian.ros.parameters import report_unknown, use_files
+from diffdrive_jacobian.ros.parameters import report_unknown, use_arguments
 from diffdrive_jacobian.ros.rclpy_internals import RCLError, UnknownROSArgsError, events_executor, reason
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
@@ -110,7 +110,7 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
         ) from error
     except (RuntimeError, UnicodeError) as error:
         raise UserError(_rule_error(arguments) or f'ROS arguments: {reason(error)}') from error
-    use_files(context, arguments)
+    use_arguments(context, arguments)
     try:
         yield context
     finally:
@@ -228,7 +228,11 @@ class NodeRunner(ABC):
         """
         if not self._unknown_reported:
             self._unknown_reported = True
-            report_unknown([node for node in self._nodes if isinstance(node, ParameterizedNode)])
+            ours = [node for node in self._nodes if isinstance(node, ParameterizedNode)]
+            try:
+                report_unknown(ours, self._nodes)
+            except ParameterError as error:
+                raise UserError(str(error)) from error
         deadline = self.seconds() + timeout
         self.settle()
         while True:

@@ -133,6 +133,15 @@ def namespace(text: str) -> str:
     return found
 
 
+def topic(text: str) -> str:
+    """Parse the name of a topic. Which names ROS accepts is checked later."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise argparse.ArgumentTypeError(f'must be the name of a topic, got {text!r}') from None
+    return text
+
+
 def _readable_file(text: str) -> str:
     if not os.path.isfile(text):
         raise argparse.ArgumentTypeError(f'no such file: {text!r}')
@@ -233,8 +242,9 @@ class Parser(argparse.ArgumentParser):
         # Slow to import.
         import difflib
 
-        close = difflib.get_close_matches(option, self.long_options, n=1)
-        return f'did you mean {close[0]}?' if close else ''
+        known = {one.strip('-'): one for one in self.long_options}
+        close = difflib.get_close_matches(option.strip('-'), known, n=1)
+        return f'did you mean {known[close[0]]}?' if close else ''
 
     def refuse_without(self, options: argparse.Namespace, option: str, *needed: str) -> None:
         """Refuse an option that has no effect without one of others."""
@@ -458,9 +468,14 @@ def given_bags(options: argparse.Namespace) -> list[Path]:
     """Return the bags that were given.
 
     Raises:
-        UserError: One was given twice.
+        UserError: One was given twice, or cannot be found.
     """
     bags: list[Path] = options.bags
+    for bag in bags:
+        try:
+            bag.resolve()
+        except (OSError, RuntimeError):
+            raise UserError(f'there is no bag {bag}: its links form a loop') from None
     if len({bag.resolve() for bag in bags}) < len(bags):
         raise UserError(f'each bag can be given once, got {" ".join(map(str, bags))}')
     return bags

@@ -184,6 +184,7 @@ def _parser() -> _cli.Parser:
         'topics',
         metavar='TOPIC',
         nargs='*',
+        type=_cli.topic,
         help=f'topics to record (default: those of a run: {", ".join(RUN_TOPICS)})',
     )
     parser.add_output('BAG', 'directory of the bag (default: run_DATE-TIME)', kind=_cli.bag_folder)

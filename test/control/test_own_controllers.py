@@ -171,6 +171,7 @@ def test_advice_is_logged_and_its_failure_does_no_harm(lockstep, capfd):
         yield f'kp {gains.kp:g} with {limits.max_v:g} m/s'
 
     node = lockstep.add(GoToGoal(controller=replace(MINE, advice=advice)))
+    lockstep.publish('goal_pose', goal(1.0, 0.0))
     assert 'kp 3 with 1000 m/s' in capfd.readouterr().err
     assert change(node, kp=6.0).successful
     logged = capfd.readouterr().err

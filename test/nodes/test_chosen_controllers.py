@@ -14,7 +14,7 @@ from support.lockstep_nodes import (
     change,
     make,
 )
-from support.ros_messages import goal, goals
+from support.ros_messages import goal, goals, path
 
 from diffdrive_jacobian.control import (
     VelocityLimits,
@@ -144,7 +144,7 @@ SPIRAL, COAST, BACK = 'is not larger than kv', 'choose kp > 2 kv', 'may not back
         ('offset_point', {'linear__x__min_velocity': 0.0}, {'linear__x__min_velocity': -0.1}, BACK),
     ],
 )
-def test_what_does_not_fit_a_law_is_warned_about_at_the_start_and_live(
+def test_what_does_not_fit_a_law_is_warned_about_with_the_first_goal_and_live(
     lockstep, capfd, name, values, others, expected
 ):
     def warned():
@@ -152,13 +152,30 @@ def test_what_does_not_fit_a_law_is_warned_about_at_the_start_and_live(
         return {words for words in (SPIRAL, COAST, BACK) if words in said}
 
     node = lockstep.add(make(GoToGoal, controller=name, **values))
-    assert warned() == {expected}
+    assert warned() == set()
+    for warnings in ({expected}, set()):
+        lockstep.publish('goal_pose', goal(1.0, 0.0))
+        assert warned() == warnings
     # Another law has no such limit, or another one.
     other = 'offset_point' if name != 'offset_point' else 'go_to_goal'
     steps = [({'controller': other}, set()), ({'controller': name}, {expected})]
     for changes, warnings in [*steps, (others, set()), (values, {expected})]:
         assert change(node, **changes).successful
         assert warned() == warnings
+
+
+def test_only_the_law_that_drives_is_warned_about(lockstep, capfd):
+    """That of goals does not drive along a path, nor that of paths to a goal."""
+    weaving = {'path_controller': 'kanayama', 'k_theta': 1.0}
+    lockstep.add(make(GoToGoal, kp=0.5, kv=0.5, **weaving))
+    for topic, message, heard, unheard in (
+        ('path', path((0.0, 0.0), (1.0, 0.0)), 'the robot weaves about the path', SPIRAL),
+        ('goal_pose', goal(1.0, 0.0), SPIRAL, 'weaves'),
+    ):
+        lockstep.publish(topic, message)
+        said = capfd.readouterr().err
+        assert heard in said
+        assert unheard not in said
 
 
 def test_a_robot_that_may_not_drive_forward_or_turn_is_warned_about(lockstep, capfd):

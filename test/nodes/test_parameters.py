@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 
@@ -305,13 +306,42 @@ SHARED = """
 
 def test_a_parameter_for_all_nodes_need_not_be_of_each(written, capfd):
     """A misspelt one is reported, and so is one that is only for this node."""
-    arguments = ['--params-file', written(SHARED), '-p', 'shape:=1']
+    arguments = ['--params-file', written(SHARED)]
     with ros_context(['go_to_goal', '--ros-args', *arguments]) as context:
         node = GoToGoal(context=context)
         report_unknown([node])
         node.destroy_node()
     reported = re.findall("unknown parameter '([^']*)'", capfd.readouterr().err)
-    assert reported == ['colour', 'kpp', 'shape']
+    assert reported == ['colour', 'kpp']
+
+
+@pytest.mark.parametrize(
+    ('given', 'meant'),
+    [
+        ('Kp:=3.0', "no node of this program has the parameter 'Kp'; did you mean 'kp'?"),
+        ('go_to_goal:shape:=1', "the parameter 'shape'; see go_to_goal --help"),
+        ('wheel_bridge:shape:=1', None),
+    ],
+)
+def test_a_parameter_that_no_node_has_is_refused_on_the_command_line(given, meant):
+    """One for another node is not given to this one."""
+    with ros_context(['go_to_goal', '--ros-args', '-p', given]) as context:
+        node = GoToGoal(context=context)
+        expected = (
+            nullcontext() if meant is None else pytest.raises(ParameterError, match=re.escape(meant))
+        )
+        with expected:
+            report_unknown([node])
+        node.destroy_node()
+
+
+def test_a_parameter_of_a_further_node_is_known():
+    with ros_context(['go_to_goal', '--ros-args', '-p', 'own:=1']) as context:
+        node, other = GoToGoal(context=context), Node('other', context=context)
+        other.declare_parameter('own', 0)
+        report_unknown([node], [other])
+        for one in (node, other):
+            one.destroy_node()
 
 
 @pytest.mark.parametrize('kind', [GoToGoal, VirtualRobot])

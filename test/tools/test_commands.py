@@ -120,7 +120,8 @@ WRONG = {
     },
     'send_path': {
         'circle:1 --no-wait --timeout 5': '--timeout has no effect with --no-wait',
-        'circle:0': 'size of a shape must be a positive number',
+        'circle:0': 'size of a shape must be in [0.001, 1e+05] m',
+        'eight:1e308': 'size of a shape must be in [0.001, 1e+05] m',
         'missing.csv': 'missing.csv: there is no such file',
         'square:1': 'path must be circle:RADIUS, line:LENGTH, eight:SIZE',
     },
