@@ -49,7 +49,7 @@ def pure_pursuit(state: Vector, reference: Vector, l_d: Number) -> tuple[Number,
     x_r, y_r, _, v_r, *_ = reference
     left = cos(theta) * (y_r - y) - sin(theta) * (x_r - x)
     l_d = maximum(l_d, hypot(x_r - x, y_r - y))
-    return v_r, 2.0 * v_r * left / l_d**2
+    return v_r, 2.0 * v_r * (left / l_d) / l_d
 
 
 LOOKAHEAD = Gain(

@@ -69,8 +69,8 @@ def line_path(length: float) -> Path:
 def figure_eight_path(size: float) -> Path:
     """Return a figure eight, the lemniscate of Bernoulli, from one of its ends to the left.
 
-    With `c = a / (1 + sin(u)^2)` it is `x = c sin(u) cos(u), y = a - c cos(u)`. The size a is in [0.001, 1e5]
-    (m): it is 2 a long in y, and narrowest at its ends, with the radius a/3.
+    With `c = a / (1 + sin(u)^2)` it is `x = c sin(u) cos(u), y = a - c cos(u)`. It is 2 a long in y, and
+    narrowest at its ends, with the radius a/3. The size a is in [0.001, 1e5] (m).
     """
     a = number('size', size, _check_size)
 

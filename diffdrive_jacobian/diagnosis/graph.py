@@ -19,6 +19,7 @@ from diffdrive_jacobian.messages.topics import (
     UNREAD,
     Topic,
 )
+from diffdrive_jacobian.parameters.wheels import SAME_WHEELS, different_wheels
 from diffdrive_jacobian.text import listed
 
 INFINITE = 2**63 - 1
@@ -84,10 +85,6 @@ class Endpoint:
     quality: Quality = Quality()
 
 
-WHEELS = ('wheel_radius', 'wheel_separation')
-"""Parameters with the dimensions for which wheel speeds are computed, and with which they are driven."""
-
-
 @dataclass(frozen=True, slots=True)
 class Participant:
     """A node."""
@@ -98,34 +95,6 @@ class Participant:
     """None: it did not report it."""
     wheels: tuple[float, ...] | None = None
     """Values of its parameters WHEELS (m). None: it has none."""
-
-
-def different_wheels(computed: tuple[float, ...], name: str, driven: tuple[float, ...]) -> str:
-    """Return what a node does whose wheels differ from those for which its speeds are computed.
-
-    Empty: they are the same.
-
-    Args:
-        computed: The values of WHEELS for which the speeds are computed (m).
-        name: Name of the node that drives by the speeds.
-        driven: Its values of WHEELS (m).
-    """
-    differences = [
-        f'{what} {there:g} m instead of {here:g} m'
-        for what, here, there in zip(WHEELS, computed, driven, strict=True)
-        if here != there
-    ]
-    if not differences:
-        return ''
-    (r, L), (their_r, their_L) = computed, driven
-    return (
-        f'{name} has {" and ".join(differences)}, for which its wheel speeds are computed: it drives '
-        f'{their_r / r:.3g} times and turns {their_r / r * L / their_L:.3g} times as fast as commanded'
-    )
-
-
-SAME_WHEELS = 'give both nodes the same dimensions, as by the same --robot or --params-file'
-"""What to do about that."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -20,7 +20,6 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
 from diffdrive_jacobian.diagnosis.graph import (
-    WHEELS,
     ClockMessages,
     Endpoint,
     Graph,
@@ -34,6 +33,7 @@ from diffdrive_jacobian.messages.codecs import STAMP
 from diffdrive_jacobian.messages.names import full_name, node_of, type_name
 from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.nodes.same_wheels import wheels_of
+from diffdrive_jacobian.parameters.wheels import WHEELS
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.ros.serialization import reader
 from diffdrive_jacobian.ros.service_client import ServiceClient, ignore

@@ -668,4 +668,6 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         for warning in self._controller.rate_warnings(
             self.parameters, self._rate, turns=self._arrival.use_heading
         ):
-            self.log_event_warning('rate', warning)
+            if warning not in self._advised:
+                self._advised.add(warning)
+                self.log_event_warning('rate', warning)

@@ -232,7 +232,7 @@ class _Session:
         controllers = client.controllers()
         parameters = HEADING_PARAMETERS if heading_matters else DRIVEN_POINT_PARAMETERS
         liveness = Liveness(client, set(controllers.values()), parameters, self._runner.seconds)
-        silent = 'the controller has not reported its parameters'
+        silent = 'the controller is asked for its parameters'
         obstacle = self._wait(
             PARAMETER_PATIENCE,
             lambda: None if liveness.answering.total() >= len(controllers) else silent,

@@ -14,8 +14,8 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.diagnosis.graph import WHEELS, different_wheels
 from diffdrive_jacobian.messages.names import is_named, node_of
+from diffdrive_jacobian.parameters.wheels import WHEELS, different_wheels
 from diffdrive_jacobian.ros.service_client import ServiceClient, ignore
 
 PATIENCE = 5.0

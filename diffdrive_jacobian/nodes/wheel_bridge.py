@@ -9,7 +9,6 @@ from geometry_msgs.msg import Twist, TwistStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from diffdrive_jacobian.diagnosis.graph import SAME_WHEELS
 from diffdrive_jacobian.messages.codecs import (
     JOINT_STATE,
     TWIST,
@@ -22,6 +21,7 @@ from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.topics import UNREAD
 from diffdrive_jacobian.nodes.same_wheels import SameWheels
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
+from diffdrive_jacobian.parameters.wheels import SAME_WHEELS
 from diffdrive_jacobian.ros.graph_faults import topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import restart_timer

@@ -280,7 +280,7 @@ def _draw_path(plane: Axes, one: Timeline, name: str, color: str, style: Any) ->
     poses, travelled = one.run.odometry.values[:, :3], distance_travelled(one)
     name = name if len(name) <= LABEL else f'{name[: LABEL // 2]}…{name[-LABEL // 2 :]}'
     # matplotlib reads a dollar as a formula, and hides labels that start with an underscore.
-    label = f'{name}: {np.ptp(one.time):.1f} s, {travelled[-1]:.2f} m'.replace('$', r'\$')
+    label = f'{name}: {np.ptp(one.time):.1f} s recorded, {travelled[-1]:.2f} m'.replace('$', r'\$')
     label = f' {label}' if label.startswith('_') else label
     plane.plot(*line(poses[:, :2], one.breaks).T, color=color, ls=style, lw=1.8, label=label)
     evenly = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], ARROWS, endpoint=False))

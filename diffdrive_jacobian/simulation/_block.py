@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.controller import Controller, Law
-from diffdrive_jacobian.control.controllers import find_controller
+from diffdrive_jacobian.control.controllers import ControllerError, find_controller
 from diffdrive_jacobian.control.goal_laws import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
@@ -75,7 +75,10 @@ class Batch:
         # What the law remembers at the start.
         self.state: tuple[float, ...] = ()
         if isinstance(law, str):
-            law = find_controller(law)
+            try:
+                law = find_controller(law)
+            except ControllerError as error:
+                raise ValueError(f'law: {error}') from None
         if isinstance(law, Controller):
             self.state, law = law.state, law.law
         self.law: Law = function('law', law)

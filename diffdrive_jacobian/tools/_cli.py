@@ -28,7 +28,19 @@ T = TypeVar('T')
 
 ROS_HINT = 'ROS arguments come after --ros-args, as in --ros-args -p NAME:=VALUE'
 _ROS_OPTIONS = ('--ros-args', '-p', '--param', '-r', '--remap', '--log-level', '--enclave', '-e')
-_FILE_ENDINGS = ('.png', '.svg', '.pdf', '.jpg', '.jpeg', '.csv', '.txt', '.yaml', '.yml')
+_FILE_ENDINGS = (
+    '.png',
+    '.svg',
+    '.pdf',
+    '.jpg',
+    '.jpeg',
+    '.csv',
+    '.txt',
+    '.yaml',
+    '.yml',
+    '.db3',
+    '.mcap',
+)
 
 # --- Types of arguments
 
@@ -368,15 +380,20 @@ class Parser(argparse.ArgumentParser):
         """Add the option to overwrite what is named."""
         self.add_argument('--force', action='store_true', help=f'overwrite {what} (default: refuse)')
 
+    def refuse(self, *names: str, why: str) -> None:
+        """Refuse an option that other programs have, and say why."""
+
+        def refuse(value: str) -> NoReturn:
+            raise argparse.ArgumentTypeError(f'{why}, got {value!r}')
+
+        self.add_argument(*names, type=refuse, help=argparse.SUPPRESS)
+
     def refuse_storage(self) -> None:
         """Refuse `--storage`, which the programs of rosbag2 have."""
-
-        def refuse(storage: str) -> NoReturn:
-            raise argparse.ArgumentTypeError(
-                f'bags are written as MCAP, got {storage!r}; `ros2 bag convert` writes other formats'
-            )
-
-        self.add_argument('-s', '--storage', type=refuse, help=argparse.SUPPRESS)
+        self.refuse(
+            *('-s', '--storage'),
+            why='bags are written as MCAP, and `ros2 bag convert` writes other formats',
+        )
 
     def add_params_file(self, text: str = 'file of ROS parameters (YAML)') -> None:
         """Add the options for a parameter file without `--ros-args`: its path, or the robot's name."""

@@ -314,7 +314,9 @@ def _parser() -> _cli.Parser:
         'distance to a goal that counts as arrived (m) (default: 0.02, unless a file sets it)',
         kind=_cli.tolerance,
     )
-    parser.add_heading('heading at the last goal (rad) (default: any)')
+    parser.add_heading(
+        'heading at the last goal (rad) (default: any; 0 if the controller always takes one, as pose)'
+    )
     parser.add_argument(
         '--controller',
         choices=CONTROLLERS,

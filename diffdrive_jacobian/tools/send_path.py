@@ -37,5 +37,10 @@ def _parser() -> _cli.Parser:
     )
     parser.add_path('path')
     parser.add_trajectory()
+    parser.refuse(
+        '--speed',
+        why='the speed along a path is the parameter path_speed of the controller, or that of '
+        '--trajectory',
+    )
     add_options(parser, 'path', 'path')
     return parser

@@ -7,7 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from diffdrive_jacobian.control import Path, PathController, VelocityLimits, line_path
+from diffdrive_jacobian.control import (
+    ControllerError,
+    Path,
+    PathController,
+    VelocityLimits,
+    find_controller,
+    line_path,
+)
 from diffdrive_jacobian.control.path_following import PathFollower, PathSettings
 from diffdrive_jacobian.control.path_laws import (
     DYNAMIC_FEEDBACK,
@@ -199,7 +206,8 @@ def test_the_look_ahead_point_is_beyond_the_end_of_an_open_path():
 
 def test_invalid_arguments_are_named():
     for arguments, words in (
-        ({'controller': 'kanayama'}, 'controller must be of class PathController'),
+        ({'controller': find_controller('pose')}, 'controller must be of class PathController'),
+        ({'controller': 'pose'}, "path_controller must be one of .* got 'pose', a law of goals"),
         ({'path': [[0, 0], [1, 0]]}, 'path must be of class Path'),
         ({'rate': 0.0}, 'rate must be positive'),
         ({'gains': {'k_y': math.nan}}, 'k_y must be in'),
@@ -207,5 +215,7 @@ def test_invalid_arguments_are_named():
     ):
         with pytest.raises(ValueError, match=words):
             follow_path(**{'controller': KANAYAMA, 'path': eight(), **arguments})
+    with pytest.raises(ControllerError, match="got 'kanayama', a law of paths"):
+        find_controller('kanayama')
     with pytest.raises(ValueError, match="lookahead must be '' or one of kp, kv, got 'l'"):
         PathController(name='mine', law=lambda *_: (0.0, 0.0), lookahead='l')

@@ -30,7 +30,7 @@ PURE = LAYERS[:4]
 WITHOUT_ROS = LAYERS[4:9]
 # Modules beside the layers, which every layer may import, and what they may import themselves.
 COMMON = {
-    **dict.fromkeys(('text', 'time_units', 'errors', 'lazy', 'safe_yaml', 'signals'), ()),
+    **dict.fromkeys(('text', 'time_units', 'errors', 'lazy', 'safe_yaml', 'signals', 'locks'), ()),
 }
 LOUD = re.compile(r'\bprint\b|\bstdout\b|\bstderr\b')
 

@@ -33,7 +33,7 @@ TOOLS = sorted(
     - set(NODES)
 )
 LINK = re.compile(r'\]\(([^)\s]+)\)')
-MOST_SKIPPED = 8
+MOST_SKIPPED = 9
 """Blocks in all pages that no test runs: those that need pip, a ROS installation, a network."""
 
 

@@ -17,6 +17,7 @@ from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel, odometry_noise
 from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
 
+REFERENCE = (0.6, 0.3, 0.4, 0.5, 0.2, -0.05, 0.1, 1.0)
 POSE, TWIST, GOAL, TURNED = (0.3, -0.2, 1.0), (0.2, 0.5), (1.0, 2.0), (1.0, -0.2, 0.3)
 WHEELS, THETA = {'r': 0.033, 'L': 0.16}, {'theta': 0.5}
 LIMITS = VelocityLimits(min_v=-0.1, max_v=0.22, min_omega=-2.0, max_omega=2.0, max_wheel_speed=10.0)
@@ -97,6 +98,14 @@ BROADCASTING = {
     control.go_to_goal: {'state': POSE, 'goal': GOAL, 'Kp': 3.0, 'Kv': 0.5},
     control.turn_in_place: {'theta': 0.5, 'heading': 3.0, 'Kp': 3.0},
     control.offset_point: {'state': POSE, 'goal': GOAL, 'k': 0.5, 'd': 0.1},
+    control.pure_pursuit: {'state': POSE, 'reference': REFERENCE, 'l_d': 0.2},
+    control.kanayama: {
+        **{'state': POSE, 'reference': REFERENCE, 'K_x': 2.0, 'K_y': 25.0, 'K_theta': 10.0}
+    },
+    control.offset_point_tracking: {'state': POSE, 'reference': REFERENCE, 'k': 1.5, 'd': 0.1},
+    control.dynamic_feedback_linearization: {
+        **{'pose': POSE, 'reference': REFERENCE, 'K_p': 4.0, 'K_d': 4.0, 'state': (0.3,), 'dt': 0.02}
+    },
     control.go_to_pose: {'state': POSE, 'goal': TURNED, 'Kp': 3.0, 'Kv': 0.5, 'h': 2.0},
     control.saturate: {'v': 3.0, 'omega': 5.0, 'limits': LIMITS, **WHEELS},
     control.resolved_rate: {

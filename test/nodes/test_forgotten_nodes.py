@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState
 from support.lockstep_nodes import ACCEPTED, CANCELED, EXECUTING, SUCCEEDED, Controller, Topics
 from support.ros_messages import goal, goals, joint_command, placement, twist, twists
 
+from diffdrive_jacobian.nodes import other_drivers
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
@@ -155,6 +156,23 @@ def test_driving_by_hand_cancels_the_goal(lockstep, add, node, capfd):
     lockstep.run_for(0.1)
     assert team.odom[-1].twist.twist.linear.x == 0.1
     assert 'drives the robot' not in said(capfd)
+
+
+def test_a_controller_of_the_same_name_is_perhaps_that_of_somebody_else(lockstep, add, node, capfd):
+    """Two people in one domain. Within a world names are different."""
+    add(VirtualRobot)
+    mine = add(GoToGoal)
+    lockstep.publish('goals', goals(goal(50.0, 0.0)))
+    theirs = node.create_publisher(Twist, 'cmd_vel', 10)
+    lockstep.run_for(1.2)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(other_drivers, 'publishers_of', lambda *_, **__: ['/go_to_goal'])
+        theirs.publish(twist(0.25, 0.0))
+        lockstep.run_for(0.1)
+    assert mine.waypoint is None
+    text = said(capfd)
+    assert 'another /go_to_goal drives the robot by /cmd_vel, so the goal is canceled' in text
+    assert 'with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or with a ROS_DOMAIN_ID of your own' in text
 
 
 @pytest.mark.parametrize('command', [Twist, TwistStamped])

@@ -7,13 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from support.lockstep_nodes import SECOND, change, comes_after
 from support.ros_messages import WHEELS, instants, twist, twist_stamped
 
+from diffdrive_jacobian.drives import overrides
 from diffdrive_jacobian.faults import TimeJump
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.simulation import Robot
 from diffdrive_jacobian.simulation.actuators import Actuators
@@ -164,3 +167,26 @@ def test_stop_leaves_the_wheels_standing_and_reports_it_once(lockstep, add, out,
     said = capfd.readouterr().err
     assert 'the wheels are stopped: the test says so' in said
     assert 'too' not in said
+
+
+@pytest.mark.parametrize(('radius', 'expected'), [(0.05, 0), (0.06, 1)])
+def test_a_robot_with_other_wheels_is_warned_of_once(lockstep, capfd, radius, expected):
+    robot = {'command_interface': 'wheels', 'wheel_radius': radius}
+    lockstep.add(VirtualRobot(parameter_overrides=overrides(robot)))
+    lockstep.add(WheelBridge(parameter_overrides=overrides({'wheel_radius': 0.05})))
+    for _ in range(3):
+        lockstep.publish('cmd_vel', twist(0.2))
+        lockstep.run_for(0.1)
+    said = capfd.readouterr().err
+    assert said.count('/virtual_robot has wheel_radius 0.06 m instead of 0.05 m') == expected
+    assert said.count('1.2 times as fast as commanded; give both nodes the same dimensions') == expected
+
+
+def test_who_has_no_wheels_is_not_compared(lockstep, capfd):
+    other = lockstep.add(Node('recorder'))
+    other.create_subscription(JointState, 'joint_command', lambda _: None, 10)
+    lockstep.add(WheelBridge())
+    for _ in range(3):
+        lockstep.publish('cmd_vel', twist(0.2))
+        lockstep.run_for(0.1)
+    assert 'instead of' not in capfd.readouterr().err

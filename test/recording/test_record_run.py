@@ -249,7 +249,7 @@ def test_the_topics_with_a_publisher_are_named():
     [
         (('-o', 'nowhere/bag'), 'cannot record to nowhere/bag: no such file or directory'),
         (('-o', 'begun'), 'recover_run begun.journal.mcap writes the bag'),
-        (('-s', 'sqlite3'), "MCAP, got 'sqlite3'; `ros2 bag convert` writes other formats"),
+        (('-s', 'sqlite3'), "MCAP, and `ros2 bag convert` writes other formats, got 'sqlite3'"),
         (('-e', '('), "must be a regular expression, got '('"),
         (('-o', 'new', '--ros-args', '--bogus'), 'ROS arguments: '),
         (('-o', 'new', 'bad//topic'), "invalid topic name 'bad//topic': "),

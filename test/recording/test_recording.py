@@ -15,6 +15,7 @@ import pytest
 from ruamel.yaml import YAML
 from support.raw_bags import channel, read_journal
 
+from diffdrive_jacobian import locks
 from diffdrive_jacobian.bags import bag_reader, journal, recover
 from diffdrive_jacobian.bags import bag_writer as building
 from diffdrive_jacobian.bags.bag_reader import open_bag
@@ -384,7 +385,7 @@ def test_a_file_system_without_locks_is_recorded_to(tmp_path, monkeypatch):
         def refuse(descriptor, operation, code=code):
             raise OSError(code, os.strerror(code))
 
-        monkeypatch.setattr(journal.fcntl, 'flock', refuse)
+        monkeypatch.setattr(locks.fcntl, 'flock', refuse)
         bag = tmp_path / str(code)
         recording = recorded(bag, *messages(3))
         assert not journal.is_being_written(journal_of(bag))

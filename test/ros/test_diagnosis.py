@@ -127,6 +127,28 @@ def test_topics_that_do_not_fit_are_named_with_a_remedy():
         check(check_topics(graph(*endpoints)), words, problems)
     twice = graph(*PAIR, nodes=(*NODES, NODES[0]))
     check(check_topics(twice), '2 nodes have the name /go_to_goal')
+    check(check_topics(twice), 'perhaps on another machine of this network')
+
+
+def test_wheels_that_differ_are_a_problem():
+    speeds = (
+        publisher('/bridge', '/r/joint_command', STATES),
+        subscription('/robot', '/r/joint_command', STATES),
+    )
+
+    def nodes(radius, separation):
+        return Participant('/bridge', False, (0.05, 0.2)), Participant(
+            '/robot', False, (radius, separation)
+        )
+
+    assert list(check_topics(graph(*speeds, nodes=nodes(0.05, 0.2)))) == []
+    assert list(check_topics(graph(*speeds, nodes=(nodes(1.0, 1.0)[0], Participant('/robot'))))) == []
+    found = list(check_topics(graph(*speeds, nodes=nodes(0.06, 0.3))))
+    assert [one.what for one in found] == [
+        '/robot has wheel_radius 0.06 m instead of 0.05 m and wheel_separation 0.3 m instead of 0.2 m, for '
+        'which its wheel speeds are computed: it drives 1.2 times and turns 0.8 times as fast as commanded '
+        'by /bridge'
+    ]
 
 
 def test_names_are_listed():

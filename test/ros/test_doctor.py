@@ -99,7 +99,7 @@ def test_exit_code_and_report_depend_on_problems(observed, capsys):
     observed(Graph(nodes=(Participant('/a', True),)))
     assert doctor.main(['--json'], Signals()) == 1
     report = json.loads(capsys.readouterr().out)
-    assert report['graph']['nodes'] == [{'name': '/a', 'use_sim_time': True}]
+    assert report['graph']['nodes'] == [{'name': '/a', 'use_sim_time': True, 'wheels': None}]
     assert [one['problem'] for one in report['findings'] if 'clock' in one['what']] == [True]
     assert report['environment']['versions']['diffdrive_jacobian']
 

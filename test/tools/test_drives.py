@@ -95,7 +95,7 @@ def test_invalid_arguments_are_named():
         with pytest.raises(error, match=words):
             drive(**{'goals': [[1.0, 1.0]], 'lockstep': True, **options})
     with in_lockstep() as runner:
-        with pytest.raises(ValueError, match=r'goals must have shape \(n, 3\)'):
+        with pytest.raises(ValueError, match=r'goals must have shape \(n, 2\) or \(n, 3\) with n > 0'):
             drive(np.zeros((0, 3)), runner=runner)
         with pytest.raises(ValueError, match='are those of the runner'):
             drive([[1.0, 1.0]], runner=runner, lockstep=True)
