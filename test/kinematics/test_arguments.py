@@ -254,3 +254,10 @@ def test_the_law_of_one_step_of_the_node_returns_floats_and_needs_the_wheels_for
         assert [type(entry) for entry in twist] == [float, float]
     with pytest.raises(ValueError, match='so r and L must be given'):
         control.saturate(3.0, 5.0, LIMITS)
+
+
+def test_an_argument_of_another_name_is_told_which_there_are():
+    """As of the parameter kp of the node."""
+    words = "go_to_goal: .*'K.'.*; it takes state, goal, Kp and Kv"
+    with pytest.raises(TypeError, match=words):
+        control.go_to_goal(POSE, (1.0, 2.0), kp=3.0, kv=0.5)

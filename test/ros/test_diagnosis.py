@@ -145,9 +145,9 @@ def test_wheels_that_differ_are_a_problem():
     assert list(check_topics(graph(*speeds, nodes=(nodes(1.0, 1.0)[0], Participant('/robot'))))) == []
     found = list(check_topics(graph(*speeds, nodes=nodes(0.06, 0.3))))
     assert [one.what for one in found] == [
-        '/robot has wheel_radius 0.06 m instead of 0.05 m and wheel_separation 0.3 m instead of 0.2 m, for '
-        'which its wheel speeds are computed: it drives 1.2 times and turns 0.8 times as fast as commanded '
-        'by /bridge'
+        '/robot has wheel_radius 0.06 m instead of 0.05 m and wheel_separation 0.3 m instead of 0.2 m, '
+        'for which its wheel speeds are computed: it drives 1.2 times and turns 0.8 times as fast as '
+        'commanded by /bridge'
     ]
 
 
