@@ -273,6 +273,13 @@ def test_nothing_is_overwritten(folder, command, arguments, names):
     assert not list(folder.iterdir())
 
 
+def test_links_that_lead_to_each_other_are_no_bag(folder):
+    for one, other in ('ab', 'ba'):
+        (folder / one).symlink_to(other)
+    for command in ('calibrate_run', 'plot_run', 'recover_run', 'replay_run', 'verify_run'):
+        assert 'there is no bag a' in refused(command, 'a')
+
+
 @pytest.mark.parametrize(
     ('command', 'arguments'),
     [
