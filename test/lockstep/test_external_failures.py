@@ -161,7 +161,7 @@ from std_msgs.msg import Float64
 rclpy.init()
 for _ in range(3):
     node = rclpy.create_node('anew')
-    node.create_subscription(Float64, 'in', print, 10)
+    node.create_subscription(Float64, 'in', lambda _: None, 10)
     for _ in range(20):
         rclpy.spin_once(node)
     node.destroy_node()
@@ -181,7 +181,7 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 rclpy.init()
 node = rclpy.create_node('strict')
-node.create_subscription(Float64, 'in', print, QoSProfile(depth=1, deadline=Duration(seconds=0.5)))
+node.create_subscription(Float64, 'in', lambda message: print(message), QoSProfile(depth=1, deadline=Duration(seconds=0.5)))
 rclpy.spin(node)
 """
 
