@@ -131,6 +131,7 @@ def solve(
     difference: Difference | None = None,
     alpha: float | None = None,
     step_tolerance: float = 0.0,
+    second_order: bool = True,
     limits: tuple[ArrayLike, ArrayLike] | None = None,
     restarts: int = 20,
     seed: int | np.random.Generator | None = 0,
@@ -171,6 +172,8 @@ def solve(
         step_tolerance: A search ends after a step `|dq|` of this or less (D), in the unit of q; whether
             the target is reached depends on the error alone. Zero ends it when q does not change in
             double precision.
+        second_order: Whether `levenberg_marquardt` adds the second derivatives of forward after ten
+            steps. False if jacobian is no derivative of forward, but maps to angular velocities.
         limits: Lower and upper limits of the joints, each of shape (n,) or one for all. Infinite for
             none. Steps end at them.
         restarts: Largest number of restarts. 0: the search starts from q0 only.
@@ -212,6 +215,7 @@ def solve(
         step_tolerance=number('step_tolerance', step_tolerance, not_negative),
         damping=number('damping', damping, positive),
         alpha=alpha,
+        second_order=bool(second_order),
         restarts=int(restarts),
         seed=seed,
     )
@@ -434,6 +438,7 @@ class Search:
     step_tolerance: float
     damping: float
     alpha: float | None
+    second_order: bool
     restarts: int
     seed: int | np.random.Generator | None
 
@@ -504,7 +509,7 @@ class Search:
             return transpose_step(JT_e, alpha)
         step = levenberg_marquardt_step(J, JT_e, still.factor)
         late = found.iterations[still.which] - found.began[still.which] >= SECOND_ORDER_AFTER
-        if late.any():
+        if self.second_order and late.any():
             step[:, late] = self._second_order_step(still._replace(J=J).keep(late), JT_e[:, late])
         return step
 

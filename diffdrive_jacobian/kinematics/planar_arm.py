@@ -232,7 +232,7 @@ class PlanarArm:
         shape (..., n) (rad). The angles are not wrapped.
         """
         q = array('q', q, self.joints)
-        return _integrate(q, q_dot, dt)
+        return integrate_joints(q, q_dot, dt)
 
     def _need_two(self, what: str) -> None:
         if self.joints != 2:
@@ -303,5 +303,6 @@ def _joint_torques(lengths: Vector, q: Vector, wrench: Vector) -> Entries:
 
 
 @formula('(n),(n),() -> (n)')
-def _integrate(q: Vector, q_dot: Vector, dt: Number) -> Entries:
+def integrate_joints(q: Vector, q_dot: Vector, dt: Number) -> Entries:
+    """Return `q + q_dot dt`."""
     return [q_i + q_dot_i * dt for q_i, q_dot_i in zip(q, q_dot, strict=True)]

@@ -1,4 +1,4 @@
-"""The spatial displacement between two poses in space: six numbers, the error of document D.
+"""Poses in space as six numbers, and the displacement between two: the error of document D.
 
 A pose is a homogeneous transform `[[R, p], [0, 1]]`, shape (4, 4), with the rotation matrix R and the
 position p (m). Everything broadcasts over leading axes. Other matrices raise ValueError. In the plane
@@ -15,9 +15,10 @@ import numpy as np
 
 from diffdrive_jacobian.kinematics.singular_values import product, times, transposed
 from diffdrive_jacobian.numerics.checks import finite
-from diffdrive_jacobian.numerics.formula import Array, formula
+from diffdrive_jacobian.numerics.elementary import cos, hypot, sinc
+from diffdrive_jacobian.numerics.formula import Array, Entries, Number, Vector, formula
 
-__all__ = ['spatial_displacement']
+__all__ = ['pose_vector', 'pose_vector_difference', 'spatial_displacement']
 
 ROUNDING = 1e-6
 """Largest deviation of `R^T R` from the identity in the norm of Frobenius."""
@@ -52,6 +53,44 @@ def spatial_displacement(T: Any, T_desired: Any) -> Array:
     return np.concatenate([t, _rotation_vector(product(R_transposed, T_desired[:3, :3]))])
 
 
+@formula('(4,4) -> (6)', T=_rigid)
+def pose_vector(T: Any) -> Array:
+    """Return the position of a pose, and its rotation as axis times angle.
+
+    For poses, shape (..., 4, 4), it is `[x, y, z, v_x theta, v_y theta, v_z theta]`, shape (..., 6) (m,
+    rad), with theta from 0 to pi.
+    """
+    return np.concatenate([T[:3, 3], _rotation_vector(T[:3, :3])])
+
+
+@formula('(6),(6) -> (6)')
+def pose_vector_difference(target: Vector, pose: Vector) -> Entries:
+    """Return the error of poses in space, for `solve(..., difference=pose_vector_difference)`.
+
+    Of pose vectors, shape (..., 6) (m, rad), it is the translation `p_target - p`, and axis times angle
+    of the rotation `R_target R^T`, both in the axes of the base. `J^T` of it, with J in these axes, is
+    the gradient of half its square.
+    """
+    w, x, y, z = _quaternion(*target[3:])
+    w_is, *v = _quaternion(*pose[3:])
+    x_is, y_is, z_is = (-component for component in v)  # of the inverse
+    rotation = [
+        w * w_is - x * x_is - y * y_is - z * z_is,
+        w * x_is + x * w_is + y * z_is - z * y_is,
+        w * y_is + y * w_is + z * x_is - x * z_is,
+        w * z_is + z * w_is + x * y_is - y * x_is,
+    ]
+    missing = [there - here for there, here in zip(target[:3], pose[:3], strict=True)]
+    return [*missing, *_logarithm(np.array(np.broadcast_arrays(*rotation)))]
+
+
+def _quaternion(x: Number, y: Number, z: Number) -> Entries:
+    """Return the unit quaternion of a rotation, `[cos(theta/2), v sin(theta/2)]`, from v theta."""
+    theta = hypot(hypot(x, y), z)
+    half = 0.5 * sinc(0.5 * theta)
+    return [cos(0.5 * theta), half * x, half * y, half * z]
+
+
 def _rotation_vector(R: Array) -> Array:
     """Return axis times angle of rotation matrices, shapes (3, ...) and (3, 3, ...), unchecked."""
     (a, b, c), (d, e, f), (g, h, i) = R
@@ -66,7 +105,11 @@ def _rotation_vector(R: Array) -> Array:
     )
     # The row of the largest entry loses no digits.
     longest = np.linalg.norm(rows, axis=1).argmax(axis=0)
-    q = np.take_along_axis(rows, longest[np.newaxis, np.newaxis], axis=0)[0]
+    return _logarithm(np.take_along_axis(rows, longest[np.newaxis, np.newaxis], axis=0)[0])
+
+
+def _logarithm(q: Array) -> Array:
+    """Return axis times angle, 0 to pi, of quaternions of any length, shapes (3, ...) and (4, ...)."""
     q = q * np.where(q[0] < 0.0, -1.0, 1.0)
     sine = np.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     theta = 2.0 * np.arctan2(sine, q[0])

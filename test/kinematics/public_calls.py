@@ -14,6 +14,7 @@ from diffdrive_jacobian.kinematics import inverse_kinematics as ik
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+from diffdrive_jacobian.kinematics.spatial_arm import SpatialArm
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel, odometry_noise
 from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
 
@@ -30,6 +31,7 @@ LINE = StraightLine([0.0, 0.0], [1.0, 0.0], 0.1)
 WAYPOINTS = Waypoints([[1.0, 0.0, 0.0], [1.0, 1.0, 2.0]])
 ARM = PlanarArm([1.0, 0.7])
 MANIPULATOR = MobileManipulator(0.033, 0.16, ARM)
+SPATIAL = SpatialArm([0.1, 0.4, 0.3, 0.0, 0.1], [1.5, 0.0, 0.3, -1.5, 0.0], 0.2, prismatic=(2,))
 Q, X_DOT, WHOLE_Q = (0.5, 0.9), (0.1, -0.2), (0.1, 0.2, 0.3, 0.5, 0.9)
 SQUARE, WIDE = ARM.jacobian(Q), PlanarArm([0.5, 0.4, 0.3]).jacobian([0.1, 0.2, 0.3])
 WEIGHTS, RANGE = (1.0, 2.0, 0.5), {'lower': (-3.0, -2.0), 'upper': (2.0, 2.5)}
@@ -72,6 +74,15 @@ BROADCASTING = {
     se2.integrate: {'pose': POSE, 'twist': TWIST, 'dt': 0.5},
     rigid_body.point_velocity: {'v': POSE, 'omega': POSE, 'offset': (0.0, 0.1, 0.2)},
     spatial.spatial_displacement: {'T': HERE, 'T_desired': THERE},
+    spatial.pose_vector: {'T': THERE},
+    spatial.pose_vector_difference: {
+        'target': (*POSE, 0.1, 0.2, 0.3),
+        'pose': (*GOAL, 0.5, -0.4, 0.2, 1.0),
+    },
+    **{call: {'q': WHOLE_Q} for call in (SPATIAL.forward_kinematics, SPATIAL.joint_positions)},
+    SPATIAL.jacobian: {'q': WHOLE_Q},
+    SPATIAL.joint_torques: {'q': WHOLE_Q, 'wrench': (*POSE, *GOAL, 0.4)},
+    SPATIAL.integrate: {'q': WHOLE_Q, 'q_dot': (3.0, 2.0, 0.1, 0.2, 0.5), 'dt': 0.1},
     iv.adjugate_inverse: {'J': SQUARE},
     iv.prioritized: {
         'tasks': TASKS,
@@ -131,6 +142,7 @@ OTHERS = {
         **dict.fromkeys(('trans_stopped_velocity', 'rot_stopped_velocity'), 0.1),
     },
     PlanarArm: {'lengths': (1.0, 0.7)},
+    SpatialArm: {'a': (0.1, 0.4), 'alpha': (1.5, 0.0), 'd': (0.2, 0.1), 'theta': (0.0, 0.5)},
     MobileManipulator: {**WHEELS, 'arm': ARM, 'mount': (0.1, 0.0)},
     Waypoints: {'poses': [POSE], 'index': 0, 'turning': False},
     WAYPOINTS.follow: {'pose': POSE, 'law': law, 'arrival': Arrival(), 'turning_gain': 3.0},

@@ -211,8 +211,8 @@ def test_a_batch_gives_what_its_robots_give_alone(call):
         batch = {}
         for key, value in arrays.items():
             lead = (3, 2) if len(arrays) == 1 else (3, 1) if key == name else (2,)
-            # Matrices of spatial_displacement are rigid motions.
-            noise = 0.0 if call is spatial.spatial_displacement else 0.01
+            # Matrices are rigid motions.
+            noise = 0.0 if call in (spatial.spatial_displacement, spatial.pose_vector) else 0.01
             batch[key] = value * (1.0 + noise * rng.random((*lead, *[1] * value.ndim)))
         together = parts(call(**batch, **fixed))
         for index in np.ndindex(3, 2):

@@ -20,6 +20,7 @@ from diffdrive_jacobian.kinematics.mobile_manipulator import (
     mobile_manipulator_jacobian,
 )
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm, arm_forward_kinematics, arm_jacobian
+from diffdrive_jacobian.kinematics.spatial_arm import SpatialArm
 
 COUNT = 100
 STEP = 1e-5
@@ -108,6 +109,8 @@ def of_arms(rng):
         arm, q = PlanarArm(rng.uniform(0.1, 1.0, links)), rng.uniform(-4.0, 4.0, (COUNT, links))
         J, numeric = arm.jacobian(q, heading=True), differences(arm.forward_kinematics, q)
         yield 'planar_arm.PlanarArm.jacobian', J, numeric
+        parallel = SpatialArm(arm.lengths, 0.0, 0.0).jacobian(q)[:, [0, 1, 5]]
+        yield 'spatial_arm.SpatialArm.jacobian', parallel, numeric
         yield 'planar_arm.PlanarArm.jacobian', arm.jacobian(q), numeric[:, :2]
         other = differences(lambda q, arm=arm: arm_forward_kinematics(arm.lengths, q), q)
         yield 'planar_arm.arm_jacobian', arm_jacobian(arm.lengths, q), other[:, :2]

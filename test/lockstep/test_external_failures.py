@@ -181,7 +181,8 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 rclpy.init()
 node = rclpy.create_node('strict')
-node.create_subscription(Float64, 'in', lambda message: print(message), QoSProfile(depth=1, deadline=Duration(seconds=0.5)))
+profile = QoSProfile(depth=1, deadline=Duration(seconds=0.5))
+node.create_subscription(Float64, 'in', lambda message: print(message), profile)
 rclpy.spin(node)
 """
 

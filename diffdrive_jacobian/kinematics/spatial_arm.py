@@ -1,0 +1,283 @@
+"""An arm in space, from its Denavit-Hartenberg parameters: poses, 6xN Jacobians, torques.
+
+Joint i turns about, or slides along, the z axis of the frame of the link before it. With the standard
+parameters the frames of two links are apart by
+
+    T_i = Rz(theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i),    T(q) = T_1 T_2 ... T_n
+
+where q_i is added to theta_i (rad), or to d_i (m) if the joint slides. Velocities of the end effector E
+are `nu = [v, omega]`, linear above angular (m/s, rad/s): of its origin, in the axes of the base or of E.
+
+Everything broadcasts over leading axes: q has shape (..., n). Wrong shapes and values that are not
+finite raise ValueError. The measures of `inverse_velocity` take the rows of a Jacobian: `J[..., :3, :]`
+for the position, `J[..., 3:, :]` for the orientation.
+
+Source: document D, 2.1 and 6; document A, 3.2.5; J. Denavit, R. S. Hartenberg, "A kinematic notation for
+lower-pair mechanisms based on matrices", 1955; P. Corke, *Robotics, Vision and Control*, 2011, 7.1 and
+8.1; doc/mathematics.md, "Manipulators".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diffdrive_jacobian.kinematics.inverse_kinematics import IKResult, solve
+from diffdrive_jacobian.kinematics.planar_arm import integrate_joints
+from diffdrive_jacobian.kinematics.spatial import pose_vector, pose_vector_difference
+from diffdrive_jacobian.numerics.checks import array, finite, floats
+from diffdrive_jacobian.numerics.elementary import cos, product, sin
+from diffdrive_jacobian.numerics.fields import integer, one_of
+from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
+
+__all__ = ['IIWA', 'PANDA', 'UR5', 'SpatialArm']
+
+FRAMES = ('base', 'end')
+"""Axes in which velocities and wrenches are given."""
+IDENTITY: Rows = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+
+def link(a: Number, alpha: Number, d: Number, theta: Number) -> tuple[Rows, Entries]:
+    """Return rotation and translation of `Rz(theta) Tz(d) Tx(a) Rx(alpha)`, unchecked."""
+    c, s, c_a, s_a = cos(theta), sin(theta), cos(alpha), sin(alpha)
+    R = [
+        [c, -s * c_a, s * s_a],
+        [s, c * c_a, -c * s_a],
+        [0.0, s_a, c_a],
+    ]
+    return R, [a * c, a * s, d]
+
+
+def link_frames(
+    a: Vector, alpha: Vector, d: Vector, theta: Vector, slides: Vector, q: Vector
+) -> list[tuple[Rows, Entries]]:
+    """Return rotation and position of the base and of each link's frame, n + 1 of them, unchecked.
+
+    A joint i with slides_i = 1 is prismatic, one with 0 revolute.
+    """
+    R, p = IDENTITY, [0.0, 0.0, 0.0]
+    frames = [(R, p)]
+    for a_i, alpha_i, d_i, theta_i, s_i, q_i in zip(a, alpha, d, theta, slides, q, strict=True):
+        R_i, p_i = link(a_i, alpha_i, d_i + s_i * q_i, theta_i + (1.0 - s_i) * q_i)
+        p = [p_k + sum(map(_times, row, p_i)) for p_k, row in zip(p, R, strict=True)]
+        R = product(R, R_i)
+        frames.append((R, p))
+    return frames
+
+
+def _times(x: Number, y: Number) -> Number:
+    return x * y
+
+
+@formula('(n),(n),(n),(n),(n),(n) -> (4,4)')
+def _forward_kinematics(
+    a: Vector, alpha: Vector, d: Vector, theta: Vector, slides: Vector, q: Vector
+) -> Rows:
+    R, p = link_frames(a, alpha, d, theta, slides, q)[-1]
+    return [[*row, p_k] for row, p_k in zip(R, p, strict=True)] + [[0.0, 0.0, 0.0, 1.0]]
+
+
+@formula('(n),(n),(n),(n),(n),(n) -> (j,3)')
+def _joint_positions(
+    a: Vector, alpha: Vector, d: Vector, theta: Vector, slides: Vector, q: Vector
+) -> Rows:
+    return [p for _, p in link_frames(a, alpha, d, theta, slides, q)]
+
+
+@formula('(n),(n),(n),(n),(n),(n) -> (6,n)')
+def _jacobian(a: Vector, alpha: Vector, d: Vector, theta: Vector, slides: Vector, q: Vector) -> Rows:
+    frames = link_frames(a, alpha, d, theta, slides, q)
+    _, p_E = frames[-1]
+    columns = []
+    for (R, p), s_i in zip(frames, slides, strict=False):
+        # The axis of the joint, and from it to the end effector.
+        z_x, z_y, z_z = (row[2] for row in R)
+        r_x, r_y, r_z = (e - k for e, k in zip(p_E, p, strict=True))
+        across = [z_y * r_z - z_z * r_y, z_z * r_x - z_x * r_z, z_x * r_y - z_y * r_x]  # z x r
+        z = [z_x, z_y, z_z]
+        columns.append(
+            [
+                *((1.0 - s_i) * turning + s_i * along for turning, along in zip(across, z, strict=True)),
+                *((1.0 - s_i) * axis for axis in z),
+            ]
+        )
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+@formula('(n),(n),(n),(n),(n),(n),(6) -> (n)')
+def _joint_torques(
+    a: Vector, alpha: Vector, d: Vector, theta: Vector, slides: Vector, q: Vector, wrench: Vector
+) -> Entries:
+    J = _jacobian.formula(a, alpha, d, theta, slides, q)
+    return [sum(map(_times, column, wrench)) for column in zip(*J, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class SpatialArm:
+    """Joints in a chain in space. All arrays are read-only.
+
+    Joints q have the shape (..., n) (rad, or m where a joint slides). Parameters of different lengths or
+    that are not finite, joints that do not exist, and limits that are no pair raise ValueError.
+    """
+
+    a: NDArray[np.float64]
+    """Distances along the x axis of each link, shape (n,) (m)."""
+    alpha: NDArray[np.float64]
+    """Angles about that axis, from one joint's axis to the next, shape (n,) (rad)."""
+    d: NDArray[np.float64]
+    """Distances along the axis of each joint, shape (n,) (m)."""
+    theta: NDArray[np.float64]
+    """Angles about the axis of each joint where q is 0, shape (n,) (rad)."""
+    slides: NDArray[np.float64]
+    """1 for each joint that slides, 0 for one that turns, shape (n,)."""
+    limits: tuple[NDArray[np.float64], NDArray[np.float64]] | None
+    """Lower and upper limits of the joints, shape (n,) each. None: they are not known."""
+
+    def __init__(
+        self,
+        a: ArrayLike,
+        alpha: ArrayLike,
+        d: ArrayLike,
+        theta: ArrayLike = 0.0,
+        prismatic: tuple[int, ...] = (),
+        limits: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> None:
+        """Take the parameters, each of shape (n,) or one for all joints."""
+        given = {'a': a, 'alpha': alpha, 'd': d, 'theta': theta}
+        values = {name: floats(name, value) for name, value in given.items()}
+        shapes = {value.shape for value in values.values() if value.ndim}
+        if len(shapes) != 1 or any(len(shape) > 1 for shape in shapes):
+            found = ', '.join(f'{name} {value.shape}' for name, value in values.items())
+            raise ValueError(f'a, alpha, d and theta must have one shape (n,), got {found}')
+        ((n,),) = shapes
+        slides = np.zeros(n)
+        for joint in prismatic:
+            slides[integer('prismatic', joint, 0, n - 1)] = 1.0
+        for name, value in {**values, 'slides': slides}.items():
+            finite(name, value)
+            object.__setattr__(self, name, _read_only(value, n))
+        object.__setattr__(self, 'limits', None if limits is None else _pair(limits, n))
+
+    @property
+    def joints(self) -> int:
+        """Number of joints, n."""
+        return len(self.a)
+
+    def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Return the pose of the end effector: `T(q) = T_1 ... T_n`, shape (..., 4, 4) (D)."""
+        return _forward_kinematics(self.a, self.alpha, self.d, self.theta, self.slides, q)
+
+    def joint_positions(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Return the origins of the base and of each link's frame, shape (..., n + 1, 3) (m)."""
+        return _joint_positions(self.a, self.alpha, self.d, self.theta, self.slides, q)
+
+    def jacobian(self, q: ArrayLike, frame: str = 'base') -> NDArray[np.float64]:
+        """Map joint velocities to the velocity of the end effector: `nu = J(q) q_dot` (D, 2.1).
+
+        With the axis z of a joint and r from it to the origin of E, its column is `[z x r, z]`, or `[z,
+        0]` if it slides. `frame` says in which axes: those of the base, or of E, `[R^T v, R^T omega]`.
+        The result has the shape (..., 6, n).
+        """
+        one_of(*FRAMES)('frame', frame)
+        J = _jacobian(self.a, self.alpha, self.d, self.theta, self.slides, q)
+        if frame == 'base':
+            return J
+        R_transposed = np.swapaxes(self.forward_kinematics(q)[..., :3, :3], -1, -2)
+        return np.concatenate([R_transposed @ J[..., :3, :], R_transposed @ J[..., 3:, :]], axis=-2)
+
+    def joint_torques(self, q: ArrayLike, wrench: ArrayLike) -> NDArray[np.float64]:
+        """Return the torques, or forces, of the joints for a wrench at E: `Q = J^T W` (D, 5).
+
+        The wrench is `[f, m]` in the axes of the base, shape (..., 6) (N, N m). The result has the shape
+        (..., n) (N m, or N where a joint slides).
+        """
+        return _joint_torques(self.a, self.alpha, self.d, self.theta, self.slides, q, wrench)
+
+    def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
+        """Return the joints after a time at constant velocity: `q + q_dot dt` (D, 4.1).
+
+        For joint velocities, shape (..., n), and durations, shape (...) (s), the result has the shape
+        (..., n). Angles are not wrapped.
+        """
+        return integrate_joints(array('q', q, self.joints), q_dot, dt)
+
+    def inverse_kinematics(self, target: ArrayLike, q0: ArrayLike, **options: Any) -> IKResult:
+        """Search for joints at which the end effector is at a pose, from a start (D, 6).
+
+        The error is what is missing in the axes of the base: the translation, and axis times angle of
+        the rotation, six entries for the `mask` (m, rad).
+
+        Args:
+            target: Poses, shape (..., 4, 4).
+            q0: Starts of the search, shape (..., n).
+            options: As for `inverse_kinematics.solve`. By default `limits` are those of the arm, with
+                50 `restarts` and 2000 `max_iterations`.
+
+        Raises:
+            ValueError: An argument has a wrong shape or value.
+        """
+        return solve(
+            lambda q: pose_vector(self.forward_kinematics(q)),
+            self.jacobian,
+            pose_vector(target),
+            q0,
+            **{
+                'difference': pose_vector_difference,
+                'second_order': False,
+                'limits': self.limits,
+                'restarts': 50,
+                'max_iterations': 2000,
+                **options,
+            },
+        )
+
+
+def _read_only(values: ArrayLike, n: int) -> NDArray[np.float64]:
+    copy = np.array(np.broadcast_to(values, n), dtype=np.float64)
+    copy.flags.writeable = False
+    return copy
+
+
+def _pair(
+    limits: tuple[ArrayLike, ArrayLike], n: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    lower, upper = (_read_only(floats('limits', side), n) for side in limits)
+    if not np.all(lower <= upper):
+        raise ValueError(f'limits must have lower <= upper, got {lower.tolist()} and {upper.tolist()}')
+    return lower, upper
+
+
+# --- Published robots
+
+UR5 = SpatialArm(
+    a=[0.0, -0.425, -0.39225, 0.0, 0.0, 0.0],
+    alpha=[pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0],
+    d=[0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823],
+    limits=(-2.0 * pi, 2.0 * pi),
+)
+"""Universal Robots UR5 up to its flange: Universal Robots, "DH parameters for calculations of kinematics
+and dynamics"."""
+PANDA = SpatialArm(
+    a=[0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088, 0.0],
+    alpha=[-pi / 2, pi / 2, pi / 2, -pi / 2, pi / 2, pi / 2, 0.0],
+    d=[0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.107],
+    limits=(
+        [-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973],
+        [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973],
+    ),
+)
+"""Franka Emika Panda up to its flange: "Franka Control Interface documentation", robot and interface
+specifications. It has Craig's parameters there, in which a and alpha belong to the link before."""
+IIWA = SpatialArm(
+    a=0.0,
+    alpha=[-pi / 2, pi / 2, pi / 2, -pi / 2, -pi / 2, pi / 2, 0.0],
+    d=[0.36, 0.0, 0.42, 0.0, 0.4, 0.0, 0.126],
+    limits=tuple(np.radians([[-limit, limit] for limit in (170, 120, 170, 120, 170, 120, 175)]).T),
+)
+"""KUKA LBR iiwa 14 R820 up to its flange: KUKA, "LBR iiwa 7 R800, LBR iiwa 14 R820, Specification";
+the signs of alpha are those of C. Faria et al., "Position-based kinematics for 7-DoF serial manipulators
+with global configuration control, joint limit and singularity avoidance", 2018."""

@@ -1,0 +1,261 @@
+"""Arms in space: published robots, differences, adjoint, planar arms, inverse kinematics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.control import resolved_rate
+from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics import se2
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+from diffdrive_jacobian.kinematics.spatial import (
+    pose_vector,
+    pose_vector_difference,
+    spatial_displacement,
+)
+from diffdrive_jacobian.kinematics.spatial_arm import IIWA, PANDA, UR5, SpatialArm
+
+STANFORD = SpatialArm(
+    a=0.0,
+    alpha=[-np.pi / 2, np.pi / 2, 0.0, -np.pi / 2, np.pi / 2, 0.0],
+    d=[0.412, 0.154, 0.0, 0.0, 0.0, 0.263],
+    prismatic=(2,),
+)
+"""The arm of Scheinman 1969: its third joint slides."""
+ARMS = {'UR5': UR5, 'Panda': PANDA, 'iiwa': IIWA, 'Stanford': STANFORD}
+every_arm = pytest.mark.parametrize('arm', ARMS.values(), ids=ARMS)
+
+
+def configurations(arm, count=50):
+    return np.random.default_rng(5).uniform(-2.0, 2.0, (count, arm.joints))
+
+
+# --- Poses
+
+ZERO = {
+    'UR5': (UR5, [-0.81725, -0.19145, -0.005491], [[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    'Panda': (PANDA, [0.088, 0.0, 0.926], [[1, 0, 0], [0, -1, 0], [0, 0, -1]]),
+    'iiwa': (IIWA, [0.0, 0.0, 1.306], np.eye(3)),
+}
+
+
+@pytest.mark.parametrize('name', ZERO)
+def test_published_robots_are_where_their_makers_say_at_zero(name):
+    arm, position, rotation = ZERO[name]
+    T = arm.forward_kinematics(np.zeros(arm.joints))
+    np.testing.assert_allclose(T[:3, 3], position, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(T[:3, :3], rotation, rtol=0.0, atol=1e-12)
+
+
+@every_arm
+def test_a_pose_is_the_product_of_the_links(arm):
+    q = configurations(arm, 1)[0]
+    T = np.eye(4)
+    for a, alpha, d, theta, slides, q_i in zip(
+        arm.a, arm.alpha, arm.d, arm.theta, arm.slides, q, strict=True
+    ):
+        d, theta = (d + q_i, theta) if slides else (d, theta + q_i)
+        turn, twist, along, across = np.eye(4), np.eye(4), np.eye(4), np.eye(4)
+        turn[:2, :2] = [[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]]
+        twist[1:3, 1:3] = [[np.cos(alpha), -np.sin(alpha)], [np.sin(alpha), np.cos(alpha)]]
+        along[2, 3], across[0, 3] = d, a
+        T = T @ turn @ along @ across @ twist
+    np.testing.assert_allclose(arm.forward_kinematics(q), T, rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(arm.joint_positions(q)[-1], T[:3, 3], rtol=0.0, atol=1e-14)
+    assert arm.joint_positions(q)[0].tolist() == [0.0, 0.0, 0.0]
+
+
+# --- Jacobians
+
+
+@every_arm
+def test_the_jacobian_is_the_derivative_of_the_pose(arm):
+    """Position and rotation, by central differences, of 50 configurations at once."""
+    q, step = configurations(arm), 1e-5
+    J = arm.jacobian(q)
+    assert J.shape == (50, 6, arm.joints)
+    for joint in range(arm.joints):
+        by = step * np.eye(arm.joints)[joint]
+        before, after = (pose_vector(arm.forward_kinematics(q + sign * by)) for sign in (-1.0, 1.0))
+        moved = pose_vector_difference(after, before) / (2.0 * step)
+        np.testing.assert_allclose(J[..., joint], moved, rtol=0.0, atol=1e-9)
+
+
+@every_arm
+def test_a_batch_gives_what_each_configuration_gives(arm):
+    q = configurations(arm).reshape(5, 10, -1)
+    for frame in ('base', 'end'):
+        J = arm.jacobian(q, frame)
+        assert J.shape == (5, 10, 6, arm.joints)
+        np.testing.assert_allclose(J[3, 7], arm.jacobian(q[3, 7], frame), rtol=0.0, atol=1e-14)
+
+
+@every_arm
+def test_the_jacobians_of_both_frames_are_adjoint(arm):
+    """Of base and end effector: the same velocity, seen from either."""
+    q = configurations(arm)
+    R = arm.forward_kinematics(q)[:, :3, :3]
+    adjoint = np.zeros((50, 6, 6))
+    adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = R
+    np.testing.assert_allclose(adjoint @ arm.jacobian(q, 'end'), arm.jacobian(q), rtol=0.0, atol=1e-14)
+    # The displacement of D is in the frame of the end effector, and its rate is that of the Jacobian.
+    by, step = np.linspace(-1.0, 1.0, arm.joints), 1e-7
+    T, moved = arm.forward_kinematics(q), arm.forward_kinematics(q + step * by)
+    rate = spatial_displacement(T, moved) / step
+    np.testing.assert_allclose(arm.jacobian(q, 'end') @ by, rate, rtol=0.0, atol=1e-6)
+
+
+def test_an_arm_in_the_plane_is_a_planar_arm():
+    lengths = [0.5, 0.4, 0.3]
+    planar, spatial = PlanarArm(lengths), SpatialArm(a=lengths, alpha=0.0, d=0.0)
+    q = configurations(planar)
+    np.testing.assert_allclose(
+        spatial.forward_kinematics(q), se2.homogeneous_3d(planar.forward_kinematics(q)), atol=1e-15
+    )
+    J = spatial.jacobian(q)
+    np.testing.assert_allclose(J[:, [0, 1, 5]], planar.jacobian(q, heading=True), rtol=0.0, atol=1e-15)
+    assert not J[:, 2:5].any()
+
+
+def test_a_joint_that_slides_moves_along_its_axis_and_turns_nothing():
+    J = STANFORD.jacobian(configurations(STANFORD))
+    assert not J[:, 3:, 2].any()
+    np.testing.assert_allclose(np.linalg.norm(J[:, :3, 2], axis=-1), 1.0)
+
+
+@every_arm
+def test_torques_have_the_power_of_the_wrench(arm):
+    """`Q^T q_dot = W^T nu`."""
+    q, rng = configurations(arm), np.random.default_rng(6)
+    wrench, q_dot = rng.normal(size=(50, 6)), rng.normal(size=(50, arm.joints))
+    power = np.einsum('kn,kn->k', arm.joint_torques(q, wrench), q_dot)
+    nu = np.einsum('kin,kn->ki', arm.jacobian(q), q_dot)
+    np.testing.assert_allclose(power, np.einsum('ki,ki->k', wrench, nu), rtol=0.0, atol=1e-12)
+
+
+# --- Redundancy
+
+
+def test_the_elbow_moves_while_the_hand_stays():
+    q = np.radians([0.0, 30.0, 0.0, -90.0, 0.0, 60.0, 0.0])
+    T, elbow = IIWA.forward_kinematics(q), IIWA.joint_positions(q)[3]
+    for _ in range(200):
+        J = IIWA.jacobian(q)
+        e = pose_vector_difference(pose_vector(T), pose_vector(IIWA.forward_kinematics(q)))
+        q_dot = resolved_rate(J, np.zeros(6), e, np.zeros(6), gain=20.0, q_dot_0=np.eye(7)[2])
+        q = IIWA.integrate(q, q_dot, 0.01)
+    assert np.linalg.norm(spatial_displacement(T, IIWA.forward_kinematics(q))) < 1e-4
+    assert np.linalg.norm(IIWA.joint_positions(q)[3] - elbow) > 0.15
+
+
+def test_a_task_without_a_rotation_leaves_the_hand_to_turn():
+    q = np.array([0.2, -1.0, 1.2, -0.5, 0.7, 0.1])
+    J, nu = UR5.jacobian(q), np.array([0.1, 0.0, 0.05, 0.0, 0.0, 0.0])
+    moved = J @ iv.damped_least_squares(*iv.masked_task(J, nu, [1, 1, 1, 0, 0, 0]), 0.0)
+    np.testing.assert_allclose(moved[:3], nu[:3], rtol=0.0, atol=1e-12)
+    assert np.linalg.norm(moved[3:]) > 0.01
+
+
+# --- Inverse kinematics
+
+
+@every_arm
+def test_reachable_poses_are_reached_within_the_limits(arm):
+    rng = np.random.default_rng(8)
+    lower, upper = limits = arm.limits or (np.full(6, -1.0), np.full(6, 1.0))
+    q, q0 = rng.uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (2, 100, arm.joints))
+    target = arm.forward_kinematics(q)
+    result = arm.inverse_kinematics(target, q0, limits=limits)
+    assert result.converged.all()
+    reached = arm.forward_kinematics(result.q[result.converged])
+    assert np.abs(spatial_displacement(target[result.converged], reached)).max() < 2e-6
+    assert np.all((result.q >= lower) & (result.q <= upper))
+
+
+def test_the_limits_of_an_arm_hold_unless_others_are_given():
+    target = PANDA.forward_kinematics(np.array([0.1, 0.3, -0.2, -1.5, 0.2, 1.8, 0.4]))
+    start = np.array([0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0])
+    result = PANDA.inverse_kinematics(target, start)
+    assert result.converged
+    lower, upper = PANDA.limits
+    assert np.all((result.q >= lower) & (result.q <= upper))
+    narrow = (result.q + 0.01, result.q + 0.02)
+    assert not PANDA.inverse_kinematics(target, start, limits=narrow, restarts=0).converged
+
+
+def test_a_position_alone_is_a_mask():
+    q = np.array([0.2, -1.0, 1.2, -0.5, 0.7, 0.1])
+    target = UR5.forward_kinematics(q)
+    target[:3, :3] = np.eye(3)
+    result = UR5.inverse_kinematics(target, q + 0.3, mask=[1, 1, 1, 0, 0, 0])
+    assert result.converged
+    np.testing.assert_allclose(UR5.forward_kinematics(result.q)[:3, 3], target[:3, 3], atol=1e-6)
+
+
+# --- Pose vectors
+
+
+def test_the_difference_of_poses_is_the_displacement_in_the_axes_of_the_base():
+    T, T_desired = (UR5.forward_kinematics(configurations(UR5) + by) for by in (0.0, 0.5))
+    delta = spatial_displacement(T, T_desired).reshape(50, 2, 3)
+    in_base = np.einsum('kij,kpj->kpi', T[:, :3, :3], delta).reshape(50, 6)
+    found = pose_vector_difference(pose_vector(T_desired), pose_vector(T))
+    np.testing.assert_allclose(found, in_base, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(found[3], pose_vector_difference(*map(pose_vector, (T_desired[3], T[3]))))
+
+
+def test_the_jacobian_gives_the_gradient_of_the_error():
+    """Exactly, also far from the target: `d(e^T e)/2 = -e^T J dq`."""
+    q = configurations(PANDA)
+    target = pose_vector(PANDA.forward_kinematics(q + 0.8))
+
+    def half_square(q):
+        e = pose_vector_difference(target, pose_vector(PANDA.forward_kinematics(q)))
+        return 0.5 * np.einsum('ki,ki->k', e, e), e
+
+    _, e = half_square(q)
+    gradient = -np.einsum('kin,ki->kn', PANDA.jacobian(q), e)
+    for joint, by in enumerate(1e-5 * np.eye(7)):
+        slope = (half_square(q + by)[0] - half_square(q - by)[0]) / 2e-5
+        np.testing.assert_allclose(gradient[:, joint], slope, rtol=0.0, atol=1e-8)
+
+
+# --- Arguments
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (
+            {'a': [1.0, 2.0], 'alpha': [0.0], 'd': 0.0},
+            r'must have one shape \(n,\), got a \(2,\), alpha \(1,\)',
+        ),
+        ({'a': 0.0, 'alpha': 0.0, 'd': 0.0}, r'must have one shape \(n,\), got a \(\)'),
+        ({'a': [[1.0]], 'alpha': 0.0, 'd': 0.0}, 'must have one shape'),
+        ({'a': [np.nan], 'alpha': 0.0, 'd': 0.0}, 'a must be finite'),
+        ({'a': ['x'], 'alpha': 0.0, 'd': 0.0}, 'a must'),
+        (
+            {'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'prismatic': (1,)},
+            'prismatic must be an integer from 0 to 0',
+        ),
+        ({'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': (1.0, -1.0)}, 'limits must have lower <= upper'),
+    ],
+)
+def test_wrong_parameters_are_named(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        SpatialArm(**arguments)
+
+
+def test_wrong_arguments_are_named():
+    for call, words in (
+        (lambda: UR5.jacobian(np.zeros(6), 'tool'), "frame must be one of 'base', 'end', got 'tool'"),
+        (lambda: UR5.jacobian(np.zeros(7)), r'q must have shape \(..., 6\)'),
+        (lambda: UR5.forward_kinematics([np.inf] * 6), 'q must be finite'),
+        (lambda: UR5.joint_torques(np.zeros(6), np.zeros(3)), r'wrench must have shape \(..., 6\)'),
+        (lambda: UR5.inverse_kinematics(np.ones((4, 4)), np.zeros(6)), 'T must be'),
+    ):
+        with pytest.raises(ValueError, match=words):
+            call()
+    with pytest.raises(ValueError, match='read-only'):
+        UR5.a[0] = 1.0
