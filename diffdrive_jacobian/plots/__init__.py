@@ -23,11 +23,14 @@ if TYPE_CHECKING:
         velocity_ellipses,
         wheel,
     )
+    from diffdrive_jacobian.plots.spatial_pictures import arm_at, elbow
 
 __all__ = [
     'PICTURES',
+    'arm_at',
     'arm_ellipses',
     'damping',
+    'elbow',
     'figure_1',
     'figure_2',
     'figure_3',
@@ -49,6 +52,10 @@ _PICTURES = {
     'geometry': ('robot_pictures', 'the robot from above with its symbols, and the point at d (B, E)'),
     'damping': ('arm_pictures', 'where the damping of two links acts, and what it costs (A)'),
     'null_space': ('arm_pictures', 'three links that move while their tip does not (A)'),
+    'elbow': (
+        'spatial_pictures',
+        'seven joints: the elbow moves while the hand stays, and the arm almost stretched (A)',
+    ),
     'lie_bracket': ('motion_pictures', 'forward, turn, back, turn back: the gap is sideways (A)'),
     'parking': ('motion_pictures', 'parallel parking by three motions (A)'),
     'path_laws': ('motion_pictures', 'four laws over one figure eight, and their errors (B)'),
@@ -63,6 +70,7 @@ _PICTURES = {
     ),
     'spring': ('arm_pictures', 'the spring that pulls and twists an arm to its desired pose (D)'),
     'arm_ellipses': ('arm_pictures', 'velocity and force ellipses of an arm along a motion (D)'),
+    'arm_at': ('spatial_pictures', 'velocity and force ellipses of any arm at one configuration (D)'),
     'figure_1': ('robot_pictures', 'figure 1 of E: the robot along the x axis'),
     'figure_2': ('robot_pictures', 'figure 2 of E: the frames, C half way between C_1 and C_2'),
     'figure_3': ('robot_pictures', 'figure 3 of E: a wheel that rolls, and its contact P'),

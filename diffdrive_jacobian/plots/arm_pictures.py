@@ -35,14 +35,14 @@ SHOWN = 4
 
 @picture
 def arm_ellipses(
-    lengths: ArrayLike = (1.0, 1.0), start: ArrayLike = (0.5, 0.0), end: ArrayLike = (1.86, 0.0)
+    lengths: ArrayLike = (1.0, 1.0), start: ArrayLike | None = None, end: ArrayLike | None = None
 ) -> Figure:
     """Draw an arm of two links whose tip moves along a line, with its ellipses, and its measures below.
 
     Args:
         lengths: Lengths of both links, shape (2,) (m).
-        start: Where the tip starts, elbow up, shape (2,) (m).
-        end: Where it ends, shape (2,) (m).
+        start: Where the tip starts, elbow up, shape (2,) (m). None: near the base.
+        end: Where it ends, shape (2,) (m). None: where the arm is almost stretched.
 
     Raises:
         ValueError: The line is out of reach.
@@ -50,6 +50,9 @@ def arm_ellipses(
     from matplotlib.figure import Figure
 
     arm = PlanarArm(lengths)
+    reach, hole = float(np.sum(arm.lengths)), float(abs(arm.lengths[0] - arm.lengths[-1]))
+    start = [max(0.25 * reach, hole + 0.05 * reach), 0.0] if start is None else start
+    end = [0.93 * reach, 0.0] if end is None else end
     line = StraightLine(start, end, speed=0.1)
     q = track_line(arm, arm.inverse_kinematics(start)[1], line).q
     drawing = Figure(figsize=(5.4, 4.7), layout='constrained')

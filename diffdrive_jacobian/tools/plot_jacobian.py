@@ -4,21 +4,37 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from diffdrive_jacobian import plots
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.numerics.fields import short
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, new_file
 from diffdrive_jacobian.plots.rendering import render, styled
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.tools import _cli, _output
 from diffdrive_jacobian.tools.entry_points import DONE
 
+if TYPE_CHECKING:
+    from diffdrive_jacobian.kinematics.spatial_arm import SpatialArm
+
 PROGRAM = 'plot_jacobian'
+OPTIONS = {
+    '--lengths': ('arm_at', 'arm_ellipses', 'damping'),
+    '--dh': ('arm_at',),
+    '--q': ('arm_at',),
+}
+"""The pictures for which an option is."""
+PARAMETERS = {'a', 'alpha', 'd', 'theta', 'prismatic'}
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
-    options = _parser().parse(arguments, ros=False)
+    parser = _parser()
+    options = parser.parse(arguments, ros=False)
+    _check(parser, options)
     output = f'{options.name}.png' if options.output is None else options.output
     try:
         path = new_file(output, FORMATS, 'picture', replace=options.force)
@@ -28,7 +44,8 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             signals.ending_at_once(),
             styled(),
         ):
-            content = render(getattr(plots, options.name)(), extension(path))
+            drawing = getattr(plots, options.name)(**_arguments(options))
+            content = render(drawing, extension(path))
         if signals.count:
             return _output.interrupted(PROGRAM, 'nothing was written')
         create(path, content, replace=options.force)
@@ -38,6 +55,58 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         return _output.cannot_write(PROGRAM, output, error)
     print(path)
     return DONE
+
+
+def _check(parser: _cli.Parser, options: argparse.Namespace) -> None:
+    """Refuse options that have no effect, or exclude each other."""
+    for option, values in (('--lengths', options.lengths), ('--dh', options.dh), ('--q', options.q)):
+        pictures = OPTIONS[option]
+        if values is not None and options.name not in pictures:
+            parser.error(f'{option} has no effect with {options.name}, but with {", ".join(pictures)}')
+    if options.lengths is not None and options.dh is not None:
+        parser.error('--lengths and --dh exclude each other')
+
+
+def _arguments(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments of the picture.
+
+    Raises:
+        UserError: The file has no arm, or the joints are not those of it.
+    """
+    from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+
+    if options.name != 'arm_at':
+        return {} if options.lengths is None else {'lengths': options.lengths}
+    found: dict[str, Any] = {}
+    if options.lengths is not None:
+        found['arm'] = PlanarArm(options.lengths)
+    if options.dh is not None:
+        found['arm'] = _read_arm(options.dh)
+    if options.q is not None:
+        found['q'] = options.q
+    return found
+
+
+def _read_arm(path: str) -> SpatialArm:
+    """Read the map of the parameters a, alpha, d, and perhaps theta and prismatic, from YAML.
+
+    Raises:
+        UserError: The file cannot be read, or has none.
+    """
+    from diffdrive_jacobian.kinematics.spatial_arm import SpatialArm
+    from diffdrive_jacobian.safe_yaml import YAML_ERRORS, load_yaml
+
+    allowed = 'a map with a, alpha and d, and perhaps theta and prismatic'
+    try:
+        found = load_yaml(Path(path))
+        if not isinstance(found, dict) or not {'a', 'alpha', 'd'} <= found.keys() <= PARAMETERS:
+            raise UserError(f'--dh {path} must be {allowed}, got {short(found, repr)}')
+        return SpatialArm(**found)
+    except OSError as error:
+        raise UserError(f'--dh {path} cannot be read: {error.strerror or error}') from error
+    except (TypeError, *YAML_ERRORS) as error:
+        why = printable(' '.join(str(error).split()), 200)
+        raise UserError(f'--dh {path} must be {allowed}: {why}') from error
 
 
 def _name(text: str) -> str:
@@ -59,6 +128,22 @@ def _parser() -> _cli.Parser:
         'be written; 2: wrong arguments, or no matplotlib; 130: interrupted.',
     )
     parser.add_argument('name', metavar='NAME', type=_name, help='the picture, one of those above')
+    parser.add_argument(
+        '--lengths',
+        metavar='M',
+        nargs='+',
+        type=_cli.positive,
+        help=f'lengths of the links, for {", ".join(OPTIONS["--lengths"])} (m)',
+    )
+    parser.add_argument(
+        '--dh',
+        metavar='FILE',
+        help='standard Denavit-Hartenberg parameters of an arm in space (YAML: a, alpha, d, and perhaps '
+        'theta and prismatic), for arm_at (m, rad)',
+    )
+    parser.add_argument(
+        '--q', metavar='Q', nargs='+', type=_cli.number, help='joints, for arm_at (rad, or m)'
+    )
     parser.add_output('FILE', f'file to write, .{", .".join(FORMATS)} (default: NAME.png)')
     parser.add_force('the file')
     return parser
