@@ -12,7 +12,6 @@ from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.lockstep._errors import LockstepError, described
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
-from diffdrive_jacobian.lockstep._waits import refuse_waits
 from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.ros.rclpy_internals import wrap_sleep
 
@@ -102,8 +101,6 @@ class Nodes:
             name = node.get_fully_qualified_name()
             raise LockstepError(f'node {name} publishes /clock, which only lockstep may do')
         self._refuse_sleep(node)
-        if node is not self.own:
-            refuse_waits(node, lambda: self._scheduler.agenda.now)
         self.note_change()
 
     def note_change(self) -> None:

@@ -172,6 +172,9 @@ class SimulatedTime:
             result = work()
             if self._scheduler.links.elsewhere:
                 self.check_threads()
+            if guard.raised is not None:
+                # A callback has caught it.
+                raise guard.raised
             return result
         except ExternalShutdownException:
             raise LockstepError(SHUT_DOWN) from None

@@ -37,7 +37,7 @@ from diffdrive_jacobian.lockstep._properties import Properties, Property
 from diffdrive_jacobian.lockstep._report import describe
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, checked_nanoseconds
-from diffdrive_jacobian.lockstep._waits import refuse_wait_for_message
+from diffdrive_jacobian.lockstep._waits import Waits
 from diffdrive_jacobian.lockstep.external.node_process import Command, NodeProcess
 from diffdrive_jacobian.lockstep.external.process import end_all
 from diffdrive_jacobian.lockstep.external.quiet import check_platform
@@ -127,7 +127,6 @@ class Lockstep:
         self._scheduler = scheduler = Scheduler(context, self._start)
         self._closing.callback(self._destroy_nodes)
         self._closing.callback(scheduler.links.close)
-        self._closing.callback(refuse_wait_for_message())
         try:
             guard = Guard(patience, lambda: scheduler.nodes)
         except ValueError as error:
@@ -144,6 +143,8 @@ class Lockstep:
             check_open=self._check_open,
             report=self.report,
         )
+        waits = Waits(context, guard, lambda: scheduler.existing, lambda: self._time.busy)
+        self._closing.callback(waits.close)
         self._processes: list[NodeProcess] = []
         self._closing.callback(self._close_processes)
         self._time.processes = self._processes

@@ -34,6 +34,8 @@ from diffdrive_jacobian.properties.base import (
     Watch,
 )
 
+ENDED_OTHERWISE = (GoalState.CANCELED, GoalState.ABORTED)
+"""States of goals that the robot need not reach any longer."""
 STANDING = Twist(0.01, 0.05)
 """Largest twist of a robot that counts as standing."""
 
@@ -76,7 +78,8 @@ def read_path(message_type: type, message: Any, seconds: float) -> SentGoal | No
         route = None if fields is None else PATH.value(*fields)
     except MessageError:
         return None
-    if route is None or not route.poses:
+    if route is None or len({pose[:2] for pose in route.poses}) < 2:
+        # A controller refuses it.
         return None
     return SentGoal(Pose(*route.poses[-1]), seconds, route.stamp)
 
@@ -85,6 +88,12 @@ def read_status(message_type: type, message: Any) -> Status | None:
     """Return the status in a GoalStatus; None: the bytes are invalid."""
     fields = _read_status(message_type, message)
     return None if fields is None else GOAL_STATUS.value(*map(int, fields))
+
+
+def _identifier(message_type: type, message: Any) -> tuple[int, ...] | None:
+    """Return the identifier of the goal in a GoalStatus; None: it has none."""
+    fields = _read_identifier(message_type, message)
+    return tuple(map(int, fields[0])) if fields is not None and any(fields[0]) else None
 
 
 def _text(stamp: Stamp) -> str:
@@ -341,6 +350,8 @@ class _Due(NamedTuple):
     """World time at which the time for it begins (s)."""
     event: str
     """What happened then."""
+    followed: FollowedGoal[SentGoal]
+    """The goal with its status."""
 
 
 class _DueGoalWatch(_GoalWatch[DueGoalProperty]):
@@ -348,6 +359,7 @@ class _DueGoalWatch(_GoalWatch[DueGoalProperty]):
         super().__init__(required, world)
         self._followers: defaultdict[Node, GoalFollower[SentGoal]] = defaultdict(GoalFollower)
         self._received: dict[Node, FollowedGoal[SentGoal]] = {}
+        self._reached: set[FollowedGoal[SentGoal]] = set()
         self.moved = self.seconds
         world.expect(*map(required.resolved, (*required.goals, required.path)))
         for topic in required.goals:
@@ -387,22 +399,27 @@ class _DueGoalWatch(_GoalWatch[DueGoalProperty]):
             if pose.distance(due.goal.pose) <= self.required.tolerance:
                 # Steps of time may be long: this may be too late.
                 self.check()
-                del self._received[due.node]
+                self._reached.add(due.followed)
 
     def due(self) -> list[_Due]:
         """Return the goals that are due."""
         if not self._received:
             return []
         nodes, end = self.world.nodes, end_of_faults(self.world)
-        return [
-            _Due(node, goal, end, 'the faults have ended')
-            if end > goal.seconds
-            else _Due(node, goal, goal.seconds, 'the goal was received')
-            for node, followed in self._received.items()
-            if (goal := followed.goal) is not None
-            and followed.state not in (GoalState.CANCELED, GoalState.ABORTED)
-            and node in nodes
-        ]
+        found = []
+        for node, newest in self._received.items():
+            followed: FollowedGoal[SentGoal] | None = newest
+            if newest.state is GoalState.ABORTED:
+                # It may have been refused. Then the one before it goes on.
+                followed = self._followers[node].driving
+            if followed is None or followed in self._reached or followed.state in ENDED_OTHERWISE:
+                continue
+            goal = followed.goal
+            if goal is not None and node in nodes:
+                begin = max(end, goal.seconds)
+                event = 'the faults have ended' if end > goal.seconds else 'the goal was received'
+                found.append(_Due(node, goal, begin, event, followed))
+        return found
 
     def where_of(self, due: _Due) -> str:
         """Return where the robot is, relative to a goal."""
@@ -478,9 +495,11 @@ class _CancelWatch(PropertyWatch[NoCommandAfterCancel]):
         world.expect(required.resolved(required.cancel))
         self._cancel = world.on_response(required.resolved(required.cancel), self._on_cancel)
 
-    def _on_goal(self, node: Node, _: type, __: Any) -> None:
-        self._canceled.pop(node, None)
-        self.note(f'{self.name_of(node)} received a goal')
+    def _on_goal(self, node: Node, message_type: type, message: Any) -> None:
+        read = read_path if message_type.__name__ == 'Path' else read_goal
+        if read(message_type, message, self.seconds) is not None:
+            self._canceled.pop(node, None)
+            self.note(f'{self.name_of(node)} received a goal')
 
     def _on_cancel(self, node: Node, _: Any) -> None:
         self._canceled[node] = self.seconds
@@ -528,7 +547,8 @@ class NoStaleGoals(Property):
 class _StaleGoalWatch(PropertyWatch[NoStaleGoals]):
     def __init__(self, required: NoStaleGoals, world: Lockstep) -> None:
         super().__init__(required, world)
-        self._newest: dict[Publisher, Stamp] = {}
+        self._newest: dict[Publisher, tuple[Stamp, Any]] = {}
+        """Stamp and identifier of the newest goal."""
         self._clock = world.now
         self._topic = self.on_published(required.topic, self._on_status)
 
@@ -537,13 +557,17 @@ class _StaleGoalWatch(PropertyWatch[NoStaleGoals]):
         if status is None or status.status != GoalState.ACCEPTED or status.stamp == UNSTAMPED:
             return
         self.check()
-        stamp, newest = status.stamp, self._newest.get(publisher, UNSTAMPED)
+        stamp, (newest, same) = status.stamp, self._newest.get(publisher, (UNSTAMPED, None))
+        identifier = _identifier(publisher.msg_type, message)
+        if identifier is not None and identifier == same:
+            # Repeated, as after another goal was refused.
+            return
         if stamp <= newest:
             self.found(
                 f'{self._topic}: ACCEPTED of {_text(stamp)}, after one with stamp '
                 f'{newest[0]}.{newest[1]:09d} s; allowed: newer stamps'
             )
-        self._newest[publisher] = stamp
+        self._newest[publisher] = stamp, identifier
         self.note(f'{self._topic}: ACCEPTED of {_text(stamp)}')
 
     def check(self) -> str | None:

@@ -344,7 +344,7 @@ def on_new_node(created: Callable[[Node], None]) -> Callable[[], None]:
 
         return initialize
 
-    return _replaced(wrap, (Node, '__init__'))
+    return replaced(wrap, (Node, '__init__'))
 
 
 def wrap_calls(wrap: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Callable[[], None]:
@@ -352,7 +352,7 @@ def wrap_calls(wrap: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Call
 
     Return what restores them. Relies on their being looked up in the class for each one.
     """
-    return _replaced(wrap, (Client, 'call_async'), (Service, 'send_response'))
+    return replaced(wrap, (Client, 'call_async'), (Service, 'send_response'))
 
 
 def wrap_publish(wrap: Callable[[Callable[..., None]], Callable[..., None]]) -> Callable[[], None]:
@@ -360,13 +360,16 @@ def wrap_publish(wrap: Callable[[Callable[..., None]], Callable[..., None]]) -> 
 
     Relies on `Publisher.publish` being looked up in the class for each message.
     """
-    return _replaced(wrap, (Publisher, 'publish'))
+    return replaced(wrap, (Publisher, 'publish'))
 
 
-def _replaced(
-    wrap: Callable[[Callable[..., Any]], Callable[..., Any]], *methods: tuple[type, str]
+def replaced(
+    wrap: Callable[[Callable[..., Any]], Callable[..., Any]], *methods: tuple[Any, str]
 ) -> Callable[[], None]:
-    """Replace methods of classes by what `wrap` makes of them. Return a function that restores them."""
+    """Replace methods of classes, or functions of modules, by what `wrap` makes of them.
+
+    Return a function that restores them.
+    """
     present = [(owner, name, getattr(owner, name)) for owner, name in methods]
     for owner, name, method in present:
         setattr(owner, name, wrap(method))
