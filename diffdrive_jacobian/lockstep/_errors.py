@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from functools import wraps
 from typing import Any
 
+from rclpy.node import Node
+
 from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.messages.names import type_name
+from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
 
 
@@ -81,29 +84,36 @@ def described(value: Any) -> str:
     return f"'{value}'" if isinstance(value, str) else f'an object of the class {type(value).__name__}'
 
 
-_TWO_TYPES = re.compile(r'existing topic name rt(/\S+) with incompatible type (\w+)::msg::dds_::(\w+)_')
-
-
-@contextmanager
-def one_type_per_topic() -> Iterator[None]:
+def one_type_per_topic(create: Callable[..., Any]) -> Callable[..., Any]:
     """Explain the error of rcl about a topic that has another type in this process.
 
-    Raises:
-        LockstepError: There is one.
+    Args:
+        create: `create_publisher` or `create_subscription` of nodes.
     """
-    try:
-        yield
-    except RCLError as error:
-        if (found := _TWO_TYPES.search(str(error))) is None:
-            raise
-        topic, package, kind = found.groups()
-        hint = ''
-        if kind.startswith('Twist'):
-            hint = (
-                '. The nodes of this package take TwistStamped with enable_stamped_cmd_vel, for example '
-                "VirtualRobot(parameter_overrides=[Parameter('enable_stamped_cmd_vel', value=True)])"
-            )
-        raise LockstepError(
-            f'{topic} cannot have the type {package}/msg/{kind}: another node of this world uses it '
-            f'with another type{hint}'
-        ) from error
+
+    @wraps(create)
+    def created(self: Node, message_type: Any, topic: str, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return create(self, message_type, topic, *args, **kwargs)
+        except RCLError as error:
+            # Those of this package explain it themselves.
+            if isinstance(self, ParameterizedNode):
+                raise
+            name, wanted = self.resolve_topic_name(topic), type_name(message_type)
+            types = dict(self.get_topic_names_and_types()).get(name, [])
+            others = [one for one in types if one != wanted]
+            if not others:
+                raise
+            hint = ''
+            if 'Twist' in wanted:
+                hint = (
+                    '. The nodes of this package take TwistStamped with enable_stamped_cmd_vel, for '
+                    "example VirtualRobot(parameter_overrides=[Parameter('enable_stamped_cmd_vel', "
+                    'value=True)])'
+                )
+            raise LockstepError(
+                f'{name} cannot have the type {wanted}: another node of this world uses it as '
+                f'{", ".join(others)}{hint}'
+            ) from error
+
+    return created

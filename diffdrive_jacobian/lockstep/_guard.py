@@ -64,8 +64,9 @@ class Guard:
         """What was raised at the current time."""
         self.since: float | None = None
         """Wall time since which callbacks are executed (s); None: none is."""
-        self.seen: dict[str, None] | None = None
-        """The callbacks that were called while they are observed; None: they are not."""
+        self.seen: dict[str, bool] | None = None
+        """What was called while callbacks are observed, and whether it is one of a node. None: they are
+        not."""
         self._profiler: Any = None
         self._main = threading.get_ident()
         self._closed = threading.Event()
@@ -116,20 +117,23 @@ class Guard:
     def stop_observing(self) -> list[str]:
         """Return which callbacks were called, and observe them no longer."""
         sys.setprofile(self._profiler)
-        seen, self.seen = list(self.seen or ()), None
-        return seen
+        seen, self.seen = self.seen or {}, None
+        # Functions that rclpy calls for them, as constructors of messages, say nothing.
+        of_nodes = [text for text, of_node in seen.items() if of_node]
+        return (of_nodes or list(seen))[:MAX_NAMED]
 
     def _on_call(self, frame: FrameType, event: str, _: Any) -> None:
-        if event == 'call' and self.seen is not None and len(self.seen) < MAX_NAMED:
+        if event == 'call' and self.seen is not None and len(self.seen) < 10 * MAX_NAMED:
             below = iter(_stack(frame))
             if _is_user(next(below, None)) and not any(map(_is_user, below)) and not _is_standard(frame):
-                self.seen[describe(frame, self._nodes())] = None
+                text, of_node = describe(frame, self._nodes())
+                self.seen[text] = of_node
 
     def _diagnose(self, seen: list[str], frame: FrameType | None) -> str:
         stack = list(filter(_is_user, _stack(frame)))
         if not seen and stack:
             inner, outer = stack[0], stack[-1]
-            callback = describe(outer, self._nodes())
+            callback, _ = describe(outer, self._nodes())
             return (
                 f'{callback} has not returned for {self._patience:g} s of wall time; it '
                 f'is at {inner.f_code.co_filename}:{inner.f_lineno} in {inner.f_code.co_name}'
@@ -157,28 +161,32 @@ def _is_standard(frame: FrameType) -> bool:
     return name.startswith(_STANDARD) and not name.startswith(_PACKAGES)
 
 
-def describe(frame: FrameType, nodes: Iterable[Node]) -> str:
-    """Return a description of the callback that a frame runs: function, entity, node."""
+def describe(frame: FrameType, nodes: Iterable[Node]) -> tuple[str, bool]:
+    """Return a description of what a frame runs, and whether that is a callback of one of the nodes."""
     where = f'{frame.f_code.co_filename}:{frame.f_code.co_firstlineno}'
     for node in nodes:
         named = f'node {node.get_fully_qualified_name()}, {where}'
         for subscription in node.subscriptions:
             if name := _runs(frame, subscription.callback):
-                return f'{name} (subscribed to {subscription.topic_name}, {named})'
+                return f'{name} (subscribed to {subscription.topic_name}, {named})', True
         for timer in node.timers:
             if name := _runs(frame, timer.callback):
-                return f'{name} (timer of {timer.timer_period_ns / NANOSECONDS:g} s, {named})'
+                return f'{name} (timer of {timer.timer_period_ns / NANOSECONDS:g} s, {named})', True
         for service in node.services:
             if name := _runs(frame, service.callback):
-                return f'{name} (service {node.resolve_service_name(service.srv_name)}, {named})'
-    return f'{frame.f_code.co_name} ({where})'
+                return f'{name} (service {node.resolve_service_name(service.srv_name)}, {named})', True
+    return f'{frame.f_code.co_name} ({where})', False
 
 
 def _runs(frame: FrameType, callback: Any) -> str:
     """Return the name of a callback if a frame runs it, otherwise an empty string."""
     while isinstance(callback, partial):
         callback = callback.func
-    function = getattr(callback, '__func__', callback)
+    function = getattr(callback, '__func__', getattr(callback, '__wrapped__', callback))
+    if not hasattr(function, '__code__'):
+        # An object that is called.
+        callback = getattr(callback, '__call__', callback)  # noqa: B004
+        function = getattr(callback, '__func__', callback)
     if getattr(function, '__code__', None) is not frame.f_code:
         return ''
     # Functions of one definition, as that which decodes the messages of our nodes, differ in what they
@@ -189,6 +197,8 @@ def _runs(frame: FrameType, callback: Any) -> str:
             if variables.get(name) is not cell.cell_contents:
                 return ''
     owner = getattr(callback, '__self__', None)
-    if owner is not None and frame.f_locals.get(frame.f_code.co_varnames[0]) is not owner:
-        return ''
+    if owner is not None and frame.f_code.co_varnames:
+        first = frame.f_locals.get(frame.f_code.co_varnames[0])
+        if first is not owner and not (isinstance(first, tuple) and first[:1] == (owner,)):
+            return ''
     return str(getattr(callback, '__qualname__', frame.f_code.co_name))

@@ -157,9 +157,14 @@ class Messaging:
                 if name not in services
                 else f'{name} is of type {services[name][0]}, not {wanted}'
             )
+        request = service_type.Request() if request is None else request
+        if not isinstance(request, service_type.Request):
+            raise LockstepError(
+                f'a request of {name} must be a {wanted}.Request, got {described(request)}'
+            )
         client = self._node.create_client(service_type, name)
         try:
-            future = client.call_async(request or service_type.Request())
+            future = client.call_async(request)
             self._time.run_until(future.done, timeout, f'a response of {name}')
             return future.result()
         finally:
@@ -168,7 +173,7 @@ class Messaging:
     def _with_type(self, topic: str, create: Callable[..., Any], *args: Any) -> Any:
         try:
             return create(*args)
-        except RuntimeError as error:
+        except (LockstepError, RuntimeError) as error:
             # Within one process Fast DDS refuses a topic of two types.
             name = self._node.resolve_topic_name(topic)
             types = dict(self._node.get_topic_names_and_types()).get(name, [])

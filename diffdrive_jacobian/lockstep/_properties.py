@@ -116,8 +116,8 @@ class Properties:
             if id(of) in left and self._offered.isdisjoint(names):
                 known = ', '.join(sorted(self._offered.difference(NOT_OF_ROBOTS))) or 'none'
                 raise LockstepError(
-                    f'{of} observes {" and ".join(names)}, which no node has offered; topics '
-                    f'and services: {known}'
+                    f'{of} observes {" and ".join(names)}, which no node has a publisher or a service '
+                    f'of; topics and services: {known}'
                 )
         for one in required:
             one.end()

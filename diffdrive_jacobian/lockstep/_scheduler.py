@@ -24,18 +24,21 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from diffdrive_jacobian.lockstep._clock import Agenda, Clocks, Timers, is_due
-from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError, one_type_per_topic
 from diffdrive_jacobian.lockstep._gate import Gate, Gates
 from diffdrive_jacobian.lockstep._link import is_latched
 from diffdrive_jacobian.lockstep._links import Links, SentElsewhere
 from diffdrive_jacobian.lockstep._services import Member, Responses, check_holdable
 from diffdrive_jacobian.lockstep._tasks import Tasks
 from diffdrive_jacobian.lockstep._wall_time import Qualities
+from diffdrive_jacobian.messages.names import type_name
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import (
+    SERVICES_OF_RCLPY,
     TimerHandle,
     events_executor,
     on_new_node,
+    replaced,
     wrap_calls,
 )
 
@@ -87,6 +90,9 @@ class Scheduler:
         self._created: list[weakref.ref[Node]] = []
         self._missing: weakref.WeakSet[Node] = weakref.WeakSet()
         self._restore_nodes = on_new_node(self._note_node)
+        self._restore_topics = replaced(
+            one_type_per_topic, (Node, 'create_publisher'), (Node, 'create_subscription')
+        )
         self.links.start(self._members, self.note_thread)
 
     def _noting(self, send: Callable[..., Any]) -> Callable[..., Any]:
@@ -140,7 +146,12 @@ class Scheduler:
             topics = [
                 one.topic_name for one in node.subscriptions if one.topic_name not in NOT_OF_ROBOTS
             ]
-            if topics or list(node.timers):
+            services = [
+                one.srv_name
+                for one in node.services
+                if not type_name(one.srv_type).startswith(SERVICES_OF_RCLPY)
+            ]
+            if topics or services or list(node.timers):
                 self._missing.add(node)
                 warnings.warn(
                     f'node {node.get_fully_qualified_name()} was created, but not added: none of its '
@@ -197,6 +208,7 @@ class Scheduler:
         """Remove all nodes and shut down."""
         self._restore_calls()
         self._restore_nodes()
+        self._restore_topics()
         self.tasks.cancel()
         for member in self._members.values():
             member.release()

@@ -98,6 +98,7 @@ class SimulatedTime:
     def step(self, at_most: float | None) -> None:
         """Advance to the time at which the next timer expires, as `Lockstep.step`."""
         end = math.inf if at_most is None else self._agenda.now + checked_nanoseconds('at_most', at_most)
+        self._scheduler.warn_of_missing()
         self._catch_up()
         if self._until_next == math.inf and at_most is None:
             raise LockstepError('no timer is running, so step needs at_most')
@@ -130,7 +131,8 @@ class SimulatedTime:
 
     def jump(self, seconds: float) -> None:
         """Jump by a duration (s), as `Lockstep.jump`."""
-        if not math.isfinite(seconds) or seconds == 0.0:
+        number = isinstance(seconds, (int, float)) and not isinstance(seconds, bool)
+        if not (number and math.isfinite(seconds) and seconds):
             raise ValueError(f'seconds must be finite and not zero, got {seconds!r}')
         before = self._clocks.now / NANOSECONDS
         fits = before + seconds <= MAX_SECONDS

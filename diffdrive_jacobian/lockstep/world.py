@@ -21,12 +21,7 @@ import rclpy
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.lockstep._errors import (
-    InitializedError,
-    LockstepError,
-    described,
-    one_type_per_topic,
-)
+from diffdrive_jacobian.lockstep._errors import InitializedError, LockstepError, described
 from diffdrive_jacobian.lockstep._fault_log import FaultEvent
 from diffdrive_jacobian.lockstep._faults import Faults
 from diffdrive_jacobian.lockstep._guard import Guard
@@ -243,8 +238,7 @@ class Lockstep:
         self._check_open()
         if isinstance(factory, Node) or not callable(factory):
             raise LockstepError(f'create takes a function that returns a node, got {described(factory)}')
-        with one_type_per_topic():
-            node = self.add(factory())
+        node = self.add(factory())
         self._nodes.created(node, factory)
         return node
 
@@ -255,6 +249,8 @@ class Lockstep:
             LockstepError: There is none.
         """
         self._check_open()
+        if not isinstance(name, str):
+            raise LockstepError(f'find takes the name of a node, got {described(name)}')
         nodes = {node.get_fully_qualified_name(): node for node in self._scheduler.nodes}
         full = absolute_name(name, self.node)
         if full not in nodes:

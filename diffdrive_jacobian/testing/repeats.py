@@ -13,6 +13,7 @@ from diffdrive_jacobian.exploration.trial import MessageDigest
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._report import brief
 from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.numerics.fields import integer
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 
@@ -44,15 +45,16 @@ def check_repeats(
 
     Args:
         scenario: Receives a new `Lockstep`, adds nodes and lets time pass.
-        runs: Number of runs.
+        runs: Number of runs, at least 2.
         args: ROS arguments for all nodes, as of `Lockstep`.
         without: Topics that are not compared, besides `/clock`, `/rosout` and `/parameter_events`.
 
     Raises:
-        ValueError: `without` is not names of topics such as '/odom'.
+        ValueError: `runs` is less than 2, or `without` is not names of topics such as '/odom'.
         LockstepError: Two runs differ. The message names the first message that does.
     """
-    if isinstance(without, str) or any(not topic.startswith('/') for topic in without):
+    integer('runs', runs, 2)
+    if isinstance(without, str) or any(not str(topic).startswith('/') for topic in without):
         raise ValueError(f"without must be names of topics such as '/odom', got {without!r}")
     first: list[tuple[int, str, str, str]] | None = None
     for number in range(runs):

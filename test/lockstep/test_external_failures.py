@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from diffdrive_jacobian.lockstep.external import datagrams, node_process
 from diffdrive_jacobian.lockstep.external import process as external_process
 from diffdrive_jacobian.lockstep.external import quiet as quietness
+from diffdrive_jacobian.lockstep.external.launch import shared_memory_of
 from diffdrive_jacobian.lockstep.external.process import ExternalProcess
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
@@ -185,6 +186,47 @@ profile = QoSProfile(depth=1, deadline=Duration(seconds=0.5))
 node.create_subscription(Float64, 'in', lambda message: print(message), profile)
 rclpy.spin(node)
 """
+
+
+LIFESPAN = DEADLINE.replace('subscription', 'publisher').replace('lambda message: print(message), ', '')
+
+
+def test_a_lifespan_in_a_process_is_warned_of(lockstep):
+    program = LIFESPAN.replace('deadline', 'lifespan')
+    with pytest.warns(UserWarning, match='publisher of /in of node /strict has a lifespan of 0.5 s'):
+        lockstep.start([sys.executable, '-c', program])
+
+
+EVENT_LOOP = """
+import asyncio, rclpy
+from std_msgs.msg import Float64
+rclpy.init()
+node = rclpy.create_node('looping')
+node.create_subscription(Float64, 'in', lambda _: None, 10)
+
+async def main():
+    while rclpy.ok():
+        rclpy.spin_once(node, timeout_sec=0)
+        await asyncio.sleep(0.05)
+
+asyncio.run(main())
+"""
+
+
+def test_an_event_loop_is_warned_of(lockstep):
+    with pytest.warns(UserWarning, match='a thread waits for files with a timeout, as an event loop'):
+        lockstep.start([sys.executable, '-c', EVENT_LOOP])
+
+
+def test_nothing_is_left_in_shared_memory_of_a_process_that_somebody_else_killed():
+    with Lockstep() as world:
+        process = world.start(command('echo'))
+        segments = shared_memory_of(process.pid)
+        assert segments
+        os.kill(process.pid, signal.SIGKILL)
+        with fails('/echo'):
+            world.run_for(1.0)
+    assert not any(map(os.path.exists, segments))
 
 
 def test_a_deadline_in_a_process_is_warned_of(lockstep):

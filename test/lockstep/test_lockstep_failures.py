@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import suppress
+from functools import lru_cache, wraps
 
 import pytest
 import rclpy.wait_for_message
@@ -12,6 +13,7 @@ from geometry_msgs.msg import Vector3
 from nav_msgs.msg import Odometry
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode
 from rclpy.logging import get_logger
 from rclpy.node import Node
@@ -110,6 +112,38 @@ def test_a_callback_that_blocks_is_named(impatient, wait):
     assert 'innocent' not in first
 
 
+def decorated(method):
+    @wraps(method)
+    def inner(*arguments):
+        return method(*arguments)
+
+    return inner
+
+
+class Called:
+    def __call__(self):
+        forever()
+
+
+class Decorated(Node):
+    @decorated
+    def on_tick(self):
+        forever()
+
+
+def test_callbacks_that_are_no_plain_functions_are_named(impatient):
+    node = Decorated('decorated')
+    for callback, name in (
+        (node.on_tick, 'Decorated.on_tick'),
+        (Called(), 'Called.__call__'),
+        (lru_cache(forever), 'forever'),
+    ):
+        timer = node.create_timer(0.1, callback)
+        with pytest.raises(LockstepError, match=rf'at \S+ s: {name} \(timer of 0.1 s, node /decorated'):
+            impatient.add(node) if node not in impatient.nodes else impatient.run_for(0.3)
+        node.destroy_timer(timer)
+
+
 def test_a_law_that_loops_is_named_with_its_node(impatient):
     """All subscriptions of our nodes share the code of one decoder."""
     impatient.add(make(VirtualRobot))
@@ -140,9 +174,50 @@ def poll(client):
         time.sleep(0.01)
 
 
+def poll_result(client):
+    future, end = client.call_async(Trigger.Request()), time.monotonic() + 0.3
+    while future.result() is None and time.monotonic() < end:
+        time.sleep(0.01)
+
+
+def poll_by_a_function(client):
+    future, end = client.call_async(Trigger.Request()), time.monotonic() + 0.3
+
+    def ready():
+        return future.done()
+
+    while not ready() and time.monotonic() < end:
+        time.sleep(0.01)
+
+
+def wait_for_an_event(client):
+    event = threading.Event()
+    client.call_async(Trigger.Request()).add_done_callback(lambda _: event.set())
+    event.wait(0.1)
+
+
+def spin(client):
+    executor = SingleThreadedExecutor()
+    executor.spin_until_future_complete(client.call_async(Trigger.Request()), timeout_sec=0.1)
+
+
+def call_and_catch_everything(client):
+    with suppress(BaseException):
+        client.call(Trigger.Request())
+
+
 @pytest.mark.parametrize(
     ('wait', 'how'),
-    [(call, 'client.call'), (call_for_a_while, 'client.call'), (poll, 'future.done')],
+    [
+        (call, r'\(client.call\)'),
+        (call_for_a_while, r'\(client.call\)'),
+        (call_and_catch_everything, r'\(client.call\)'),
+        (poll, r'\(future.done\)'),
+        (poll_by_a_function, r'\(future.done\)'),
+        (poll_result, r'\(future.result\)'),
+        (spin, r'\(future.done\)'),
+        (wait_for_an_event, 'until a timeout'),
+    ],
 )
 def test_a_callback_that_waits_for_a_response_is_named_also_with_a_timeout(lockstep, wait, how):
     node = Node('waiting')
@@ -156,10 +231,31 @@ def test_a_callback_that_waits_for_a_response_is_named_also_with_a_timeout(locks
 
     with pytest.raises(
         LockstepError,
-        match=rf'at 1 s: node /waiting waits for a response of /other \({how}\), in {wait.__name__} '
+        match=rf'at 1 s: node /waiting waits for a response of /other {how}, in ({wait.__name__}|ready) '
         r'\(.*test_lockstep_failures.py:\d+\): it cannot arrive',
     ):
         run()
+
+
+def test_a_node_beside_the_world_that_is_spun_in_a_callback_is_named(lockstep):
+    """The usual way to call a service from a callback: it would get no answer, in silence."""
+    helper = Node('helper')
+    client = helper.create_client(Trigger, 'other')
+    lockstep.node.create_service(Trigger, 'other', lambda _, response: response)
+
+    def ask():
+        rclpy.spin_until_future_complete(helper, client.call_async(Trigger.Request()), timeout_sec=0.2)
+
+    lockstep.node.create_timer(0.1, ask)
+    with pytest.raises(LockstepError, match='node /helper waits for a response of /other'):
+        lockstep.run_for(0.3)
+
+
+def test_a_callback_that_sleeps_by_a_rate_is_named(lockstep):
+    node = lockstep.add(Node('sleeping'))
+    node.create_timer(0.1, lambda: node.create_rate(10.0).sleep())
+    with pytest.raises(LockstepError, match='a callback sleeps by a rate, in <lambda>'):
+        lockstep.run_for(0.3)
 
 
 def test_a_callback_may_look_whether_a_response_has_come(lockstep):
@@ -179,6 +275,23 @@ def test_a_callback_may_look_whether_a_response_has_come(lockstep):
     assert seen[:2] == [False, True]
     again = client.call_async(Trigger.Request())
     lockstep.run_until(again.done, 1.0)
+
+
+def test_each_callback_and_the_test_may_look_on_their_own(lockstep):
+    """Not one of them waits, however many look at one time."""
+    node, seen = lockstep.add(Node('looking')), []
+    client = node.create_client(Trigger, 'never_there')
+    future = client.call_async(Trigger.Request())
+    node.create_subscription(Vector3, 'a', lambda _: seen.append(future.done()), 10)
+    for _ in range(10):
+        lockstep.publish('a', Vector3())
+        assert not future.done()
+        assert future.result() is None
+    assert seen == 10 * [False]
+    with pytest.raises(LockstepError, match='of /never_there would never return: time passes'):
+        client.call(Trigger.Request())
+    waited = threading.Event().wait(0.001)
+    assert not waited
 
 
 def test_a_callback_that_waits_for_a_message_is_named(lockstep):

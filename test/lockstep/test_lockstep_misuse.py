@@ -22,7 +22,7 @@ from support.lockstep_nodes import make
 from users_nodes import Blinker, Echo
 
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.testing import Lockstep, LockstepError
+from diffdrive_jacobian.testing import Lockstep, LockstepError, check_repeats
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -443,10 +443,27 @@ def test_a_controller_of_stamped_twists_beside_a_robot_of_others_is_explained(lo
             self.create_publisher(TwistStamped, 'cmd_vel', 10)
 
     match = '/cmd_vel cannot have the type geometry_msgs/msg/TwistStamped: .* enable_stamped_cmd_vel'
+    for create in (Stamped, lambda: lockstep.create(Stamped)):
+        with pytest.raises(LockstepError, match=match):
+            create()
+    node = lockstep.add(Node('late'))
+    node.create_timer(0.1, lambda: node.create_subscription(TwistStamped, 'cmd_vel', print_nothing, 10))
     with pytest.raises(LockstepError, match=match):
-        lockstep.create(Stamped)
+        lockstep.run_for(0.2)
+    lockstep.remove(node)
     with pytest.raises(LockstepError, match=match):
         lockstep.start([sys.executable, '-c', STAMPED])
+
+
+@pytest.mark.process
+def test_a_robot_of_twists_after_a_program_of_others_is_explained(lockstep):
+    lockstep.start([sys.executable, '-c', STAMPED])
+    with pytest.raises(LockstepError, match=r'/cmd_vel cannot have the type .*enable_stamped_cmd_vel'):
+        lockstep.start([sys.executable, '-c', STAMPED.replace('TwistStamped', 'Twist')])
+
+
+def print_nothing(_):
+    pass
 
 
 STAMPED = """
@@ -455,10 +472,26 @@ from geometry_msgs.msg import TwistStamped
 from rclpy.node import Node
 
 rclpy.init()
-node = Node('stamped')
+node = Node('of_TwistStamped')
 node.create_publisher(TwistStamped, 'cmd_vel', 10)
 rclpy.spin(node)
 """
+
+
+@pytest.mark.parametrize(
+    ('call', 'words'),
+    [
+        (lambda world: world.find(None), 'find takes the name of a node'),
+        (lambda world: world.jump('x'), "seconds must be finite and not zero, got 'x'"),
+        (lambda world: world.call(Trigger, 'ask', Trigger), 'a request of /ask must be a std_srvs/srv/'),
+        (lambda _: check_repeats(lambda world: None, runs=1), 'runs must be an integer of at least 2'),
+        (lambda _: check_repeats(lambda world: None, without=[1]), 'without must be names of topics'),
+    ],
+)
+def test_arguments_of_another_kind_are_named(lockstep, call, words):
+    lockstep.node.create_service(Trigger, 'ask', lambda _, response: response)
+    with pytest.raises((LockstepError, ValueError), match=words):
+        call(lockstep)
 
 
 def test_a_condition_that_is_no_function_is_refused(lockstep):

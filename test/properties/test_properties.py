@@ -114,7 +114,7 @@ def test_nothing_that_a_node_can_notice_is_changed(lockstep):
     before = graph()
     lockstep.require(*(one for one, _ in VALUES))
     assert graph() == before
-    with pytest.raises(LockstepError, match='which no node has offered'):
+    with pytest.raises(LockstepError, match='which no node has a publisher'):
         lockstep.finish()
 
 

@@ -164,6 +164,48 @@ def test_a_robot_that_stands_at_the_goal_too_late_is_said_to(lockstep, scene):
         lockstep.run_for(2.0)
 
 
+def refused_goal(world):
+    message = goal_at(1.0, stamp=60)
+    message.header.frame_id = 'elsewhere'
+    world.publish('goal_pose', message)
+
+
+def refused_path(world):
+    world.publish('path', path((1.0, 0.0), stamp=60))
+
+
+@pytest.mark.parametrize(
+    ('required', 'refuse'),
+    [
+        *((KeepsDriving, refuse) for refuse in (refused_goal, refused_path)),
+        *((ArrivesOnceFaultsEnd, refuse) for refuse in (refused_goal, refused_path)),
+        # It knows what was published, not what was refused.
+        (ReachesGoal, refused_path),
+    ],
+)
+def test_a_goal_is_due_after_another_one_was_refused(with_paths, required, refuse):
+    with_paths.require(required(2.0), NoStaleGoals(), StatusProtocol())
+    with_paths.publish('goal_pose', goal_at(5.0, stamp=50))
+    refuse(with_paths)
+    with_paths.run_for(0.3)
+    assert with_paths.last('goal_status').status == EXECUTING
+    assert change(with_paths.controller, **{'linear.x.max_velocity': 0.0}).successful
+    with pytest.raises(PropertyViolation, match=required.__name__):
+        with_paths.run_for(5.0)
+
+
+def test_a_refused_path_is_no_goal_after_a_cancel(lockstep, scene):
+    student = lockstep.add(Student())
+    lockstep.require(NoCommandAfterCancel())
+    lockstep.call(Trigger, 'cancel_goal')
+    scene.send(path())
+    scene.send(path((1.0, 0.0)))
+    lockstep.settle()
+    student.commands.publish(student.command)
+    with pytest.raises(PropertyViolation, match='after /student has responded to /cancel_goal'):
+        lockstep.run_for(0.1)
+
+
 @pytest.mark.parametrize('required', [KeepsDriving, ArrivesOnceFaultsEnd])
 def test_the_end_of_a_path_is_a_goal_of_its_controller(with_paths, required):
     with_paths.require(required(20.0))

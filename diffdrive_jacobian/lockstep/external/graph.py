@@ -39,6 +39,8 @@ class Quality(NamedTuple):
     liveliness: LivelinessPolicy
     lease: int
     """Lease duration of the liveliness (ns)."""
+    lifespan: int
+    """For how long a message is valid (ns), which decides nothing but is warned of."""
 
     def __str__(self) -> str:
         """Return the policies, and the durations that have a limit."""
@@ -60,6 +62,7 @@ class Quality(NamedTuple):
             deadline=Duration(nanoseconds=self.deadline),
             liveliness=self.liveliness,
             liveliness_lease_duration=Duration(nanoseconds=self.lease),
+            lifespan=Duration(nanoseconds=self.lifespan),
         )
 
 
@@ -137,7 +140,7 @@ def marks(node: Node) -> dict[str, bytes]:
 
 
 def qualities_of(infos: Iterable[TopicEndpointInfo], node: str) -> set[Quality]:
-    """Return the qualities of service of the endpoints of a node. Lifespans run on wall time."""
+    """Return the qualities of service of the endpoints of a node."""
     profiles = [info.qos_profile for info in infos if node_of(info) == node]
     return {
         Quality(
@@ -146,6 +149,7 @@ def qualities_of(infos: Iterable[TopicEndpointInfo], node: str) -> set[Quality]:
             profile.deadline.nanoseconds,
             profile.liveliness,
             profile.liveliness_lease_duration.nanoseconds,
+            profile.lifespan.nanoseconds,
         )
         for profile in profiles
     }

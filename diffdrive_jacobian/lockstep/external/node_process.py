@@ -502,6 +502,7 @@ class NodeProcess:
         for pid in self._participants:
             self._datagrams.watch(pid)
         self._marks = graphs.marks(self._outside)
+        self.child.note_shared_memory(self._participants)
         self._warn()
 
     def _warn(self) -> None:
@@ -512,6 +513,11 @@ class NodeProcess:
             why = 'an executor with several threads may execute callbacks at the same time'
         elif threads and len(self._stand_ins) > 1:
             why = 'rclcpp calls timers of one of several nodes that are due at once in any order'
+        elif self._quiet.polls_files:
+            why = (
+                'a thread waits for files with a timeout, as an event loop of asyncio, and what it does '
+                'by itself is not waited for'
+            )
         if why and not self._connected:
             warnings.warn(f'{self.child.title}: {why}; check_repeats shows it', stacklevel=6)
 
@@ -866,6 +872,9 @@ class NodeProcess:
         try:
             self._quiet.wait(self._command.patience, asks or self._asks)
         except LockstepError as error:
+            if self._connected:
+                # What it did may be the cause.
+                self._check_present()
             names = ', '.join(self._stand_ins) or self.child.title
             raise LockstepError(
                 f'{names} {error}\n  a loop that polls or sleeps on wall time cannot run in lockstep, '

@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -193,6 +193,11 @@ class ExternalProcess:
             # A program that ends by an exception of its handler leaves them, too.
             self._segments |= shared_memory_of(self.pid)
             os.killpg(self.root, number)
+
+    def note_shared_memory(self, pids: Iterable[int]) -> None:
+        """Note the files in shared memory of its processes, which are removed when it has ended."""
+        for pid in pids:
+            self._segments |= shared_memory_of(pid)
 
     def stop(self, timeout: float = CLOSING) -> int:
         """End it by SIGINT, and kill it if it does not end. Return the exit code.

@@ -46,6 +46,8 @@ WAITS = {
 }
 """Numbers of the system calls that wait, with the place of their timeout among the arguments: futex,
 poll, select, epoll; and of recvfrom, recvmsg, wait4, waitid, which have none."""
+FUTEX = (b'202', b'98')
+"""Number of the system call in which threads wait for one another, on both machines."""
 ENDLESS = (b'0x0', b'0xffffffff', b'0xffffffffffffffff')
 """Timeouts that are none."""
 RCLCPP = 'librclcpp.so'
@@ -166,6 +168,8 @@ class Quiet:
         self._dds: dict[int, list[range]] = {}
         self._polling: set[int] = set()
         """Threads that wait with a timeout in an idle process, but not in DDS."""
+        self.polls_files = False
+        """Whether one of them waits for files, as an event loop does, and no executor."""
         self._ended: set[int] = set()
         self.waits_in_callback = False
         """Whether all was quiet at the last look but for callbacks that wait with a timeout."""
@@ -332,7 +336,7 @@ class Quiet:
 
     def learn(self) -> None:
         """Note which threads wait with a timeout, and how: the process is idle, and was found quiet."""
-        timed = []
+        timed, calls = [], {}
         self.loops = True
         for thread in self._threads.values():
             number, *arguments = thread.idle.split() or [b'']
@@ -341,6 +345,7 @@ class Quiet:
             place = self._waits.get(number, NEVER)
             if place != NEVER and arguments[place] not in ENDLESS:
                 timed.append((thread, self._addresses(thread, arguments)))
+                calls[thread] = number
             thread.idle = b''
         named = [found for thread, found in timed if thread.read('comm').startswith('dds.')]
         self._places = {min(found) for found in named if found}
@@ -352,7 +357,9 @@ class Quiet:
                 loops[key] = min(times, self._loops.get(key, times))
                 self.loops = self.loops and times > loops[key]
         self._loops = loops
-        self._polling = {thread.tid for thread, found in timed if self._places.isdisjoint(found)}
+        polling = {thread for thread, found in timed if self._places.isdisjoint(found)}
+        self._polling = {thread.tid for thread in polling}
+        self.polls_files = any(number not in FUTEX for number in map(calls.get, polling))
 
     def _is_in_callback(self, thread: _Thread, arguments: list[bytes]) -> bool:
         """Return whether a thread that waits with a timeout does so neither in DDS nor always."""

@@ -19,7 +19,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 
-from diffdrive_jacobian.lockstep._errors import LockstepError, one_type_per_topic
+from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._link import is_latched
 from diffdrive_jacobian.ros.rclpy_internals import (
     lost_messages,
@@ -101,8 +101,7 @@ def from_topic(
     )
     may_lose = profile.reliability == ReliabilityPolicy.BEST_EFFORT
     take_next, release = message_taker(subscription)
-    with one_type_per_topic():
-        publisher = inside.create_publisher(kind, topic, profile)
+    publisher = inside.create_publisher(kind, topic, profile)
 
     def take() -> Iterator[Arrived]:
         lasting = is_latched(subscription)
@@ -167,8 +166,7 @@ def to_topic(
     def receive(data: bytes) -> None:
         deliver(partial(send, data))
 
-    with one_type_per_topic():
-        inside.create_subscription(kind, topic, receive, profile, raw=True)
+    inside.create_subscription(kind, topic, receive, profile, raw=True)
     return Relay(publisher.get_subscription_count)
 
 
