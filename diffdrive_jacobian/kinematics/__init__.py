@@ -1,4 +1,4 @@
-"""Jacobians and motions of wheeled robots and planar arms: pure functions over NumPy arrays, no ROS."""
+"""Jacobians and motions of wheeled robots and arms: pure functions over NumPy arrays, no ROS."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         rigid_body,
         se2,
         spatial,
+        spatial_arm,
     )
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     'rigid_body',
     'se2',
     'spatial',
+    'spatial_arm',
 ]
 if not TYPE_CHECKING:
     # Nodes, which need few of them, start faster than with all.

@@ -259,8 +259,9 @@ UR5 = SpatialArm(
     d=[0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823],
     limits=(-2.0 * pi, 2.0 * pi),
 )
-"""Universal Robots UR5 up to its flange: Universal Robots, "DH parameters for calculations of kinematics
-and dynamics"."""
+"""Universal Robots UR5 up to its flange.
+
+Source: Universal Robots, "DH parameters for calculations of kinematics and dynamics"."""
 PANDA = SpatialArm(
     a=[0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088, 0.0],
     alpha=[-pi / 2, pi / 2, pi / 2, -pi / 2, pi / 2, pi / 2, 0.0],
@@ -270,14 +271,18 @@ PANDA = SpatialArm(
         [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973],
     ),
 )
-"""Franka Emika Panda up to its flange: "Franka Control Interface documentation", robot and interface
-specifications. It has Craig's parameters there, in which a and alpha belong to the link before."""
+"""Franka Emika Panda up to its flange.
+
+Source: "Franka Control Interface documentation", robot and interface specifications, where a and alpha
+belong to the link before, as in Craig's parameters."""
 IIWA = SpatialArm(
     a=0.0,
     alpha=[-pi / 2, pi / 2, pi / 2, -pi / 2, -pi / 2, pi / 2, 0.0],
     d=[0.36, 0.0, 0.42, 0.0, 0.4, 0.0, 0.126],
     limits=tuple(np.radians([[-limit, limit] for limit in (170, 120, 170, 120, 170, 120, 175)]).T),
 )
-"""KUKA LBR iiwa 14 R820 up to its flange: KUKA, "LBR iiwa 7 R800, LBR iiwa 14 R820, Specification";
-the signs of alpha are those of C. Faria et al., "Position-based kinematics for 7-DoF serial manipulators
-with global configuration control, joint limit and singularity avoidance", 2018."""
+"""KUKA LBR iiwa 14 R820 up to its flange.
+
+Source: KUKA, "LBR iiwa 7 R800, LBR iiwa 14 R820, Specification"; the signs of alpha as in C. Faria et
+al., "Position-based kinematics for 7-DoF serial manipulators with global configuration control, joint
+limit and singularity avoidance", 2018."""

@@ -169,8 +169,9 @@ def elbow() -> Figure:
     rest.set(
         title=r'hand at rest: $\dot q = N \dot q_0$', xlabel='x [m]', ylabel='y [m]', zlabel='z [m]'
     )
-    rest.set_aspect('equal')
+    rest.set(xlim=(-0.05, 0.5), ylim=(-0.3, 0.1), zlim=(0.0, 0.8))
     rest.set(xticks=[0.0, 0.4], yticks=[-0.2, 0.0], zticks=[0.0, 0.2, 0.4, 0.6])
+    rest.set_box_aspect((0.55, 0.4, 0.8), zoom=0.9)
     rest.view_init(**SIDE)
     rest.legend(loc='upper left')
     speeds = drawing.add_subplot(grid[0, 1])
