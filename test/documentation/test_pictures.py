@@ -14,8 +14,10 @@ from matplotlib.patches import Polygon
 from matplotlib.text import Text
 
 from diffdrive_jacobian import plots
-from diffdrive_jacobian.plots import arm_pictures, rendering
+from diffdrive_jacobian.kinematics.spatial_arm import IIWA
+from diffdrive_jacobian.plots import arm_pictures, rendering, spatial_pictures
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools import plot_jacobian
 from diffdrive_jacobian.tools.plot_jacobian import main
 
 LARGEST = 100_000
@@ -133,12 +135,61 @@ def test_the_command_writes_a_picture(folder, capsys, arguments, file, begin):
     assert (folder / file).read_bytes().startswith(begin)
 
 
+DH = 'a: [0, 0.4, 0.3]\nalpha: [1.5708, 0, 0]\nd: [0.2, 0, 0]\n'
+
+
+@pytest.mark.parametrize(
+    ('options', 'axes', 'rings'),
+    [
+        (('--lengths', '1', '0.7', '0.3', '--q', '0.5', '-1', '1'), 'x [m]', 2),
+        (('--lengths', '1', '1', '--q', '0', '0'), 'x [m]', 2),
+        (('--dh', 'arm.yaml'), 'z [m]', 6),
+        (('--dh', 'slides.yaml', '--q', '0.5', '-1', '0.1'), 'z [m]', 6),
+    ],
+)
+def test_any_arm_is_drawn_at_one_configuration(folder, monkeypatch, options, axes, rings):
+    """An ellipse of velocities and one of forces, three of each in space."""
+    (folder / 'arm.yaml').write_text(DH)
+    (folder / 'slides.yaml').write_text(DH + 'theta: 0.1\nprismatic: [2]\n')
+    drawn = []
+    monkeypatch.setattr(plot_jacobian, 'render', lambda figure, ending: drawn.append(figure) or b'')
+    assert run('arm_at', *options) == 0
+    (plane,) = drawn[0].axes
+    assert axes in {plane.get_xlabel(), getattr(plane, 'get_zlabel', str)()}
+    assert len([line for line in plane.lines if len(line.get_xdata()) == 100]) == rings
+
+
+@pytest.mark.parametrize(
+    'text', ['', '3', 'a: 1', DH + 'b: 1', DH.replace('0.3', 'x'), 'a: [', DH + 'prismatic: [7]']
+)
+def test_a_file_without_an_arm_is_refused(folder, capsys, text):
+    (folder / 'arm.yaml').write_text(text)
+    assert run('arm_at', '--dh', 'arm.yaml') == 2
+    assert 'arm.yaml must be a map with a, alpha and d, and perhaps theta' in capsys.readouterr().err
+    assert [one.name for one in folder.iterdir()] == ['arm.yaml']
+
+
+def test_the_elbow_moves_and_damping_bounds_the_joints():
+    q = spatial_pictures.self_motion()
+    hands = IIWA.forward_kinematics(q)
+    assert np.abs(hands - hands[0]).max() < 1e-4
+    exact, damped = (spatial_pictures.outwards(damped=damped) for damped in (False, True))
+    fastest = [np.linalg.norm(run[2], axis=-1).max() for run in (exact, damped)]
+    assert fastest[1] < 0.5 * fastest[0]
+    assert exact[3].max() < 1e-3 < damped[3].max() < 5e-3
+
+
 @pytest.mark.parametrize(
     ('arguments', 'code', 'message'),
     [
         (('geomtry',), 2, "argument NAME: must be one of geometry, .*got 'geomtry'"),
         ((), 2, 'the following arguments are required: NAME'),
         (('geometry', '-o', 'a.jpg'), 2, "the picture must end in .png, .svg, .pdf, got 'a.jpg'"),
+        (('geometry', '--q', '1'), 2, '--q has no effect with geometry, but with arm_at'),
+        (('arm_at', '--q', '1'), 2, r'q must have shape \(..., 2\), got \(1,\)'),
+        (('arm_at', '--lengths', '1', '--dh', 'a.yaml'), 2, '--lengths and --dh exclude each other'),
+        (('arm_at', '--dh', 'a.yaml'), 2, '--dh a.yaml cannot be read: No such file'),
+        (('arm_ellipses', '--lengths', '1', '1', '1'), 2, 'is for an arm of 2 links, this one has 3'),
         (('geometry', '--ros-args'), 2, 'plot_jacobian takes no ROS arguments'),
         (('geometry', '-o', 'none/a.png'), 1, 'none/a.png cannot be written: No such file or directory'),
     ],
