@@ -81,6 +81,8 @@ UNCONFIRMED = 0.5
 """Time for nodes without parameter services to discover the endpoints of the world (s)."""
 UNASKED = 100
 """Largest number of deliveries after which the graph is looked at, although nothing new was told."""
+DESTRUCTION = 0.5
+"""Time in which all entities of a node that is destroyed disappear, and a new one appears (s)."""
 END = 2.0
 """Time in which a process ends after a process of its nodes has (s)."""
 SYNCHRONOUS = {'RMW_FASTRTPS_PUBLICATION_MODE': 'SYNCHRONOUS'}
@@ -750,18 +752,26 @@ class NodeProcess:
         Raises:
             LockstepError: They are not, or do not follow simulated time any more.
         """
-        there = {graph.full_name for graph in graphs.nodes_beside(self._outside)}
-        marks = graphs.marks(self._outside)
-        anew = {name for name, mark in self._marks.items() if marks.get(name, mark) != mark}
-        if gone := sorted(name for name in self._stand_ins if name in anew or name not in there):
+        end = time.monotonic() + DESTRUCTION
+        while not (gone := self._gone()) and (untimed := self._untimed()):
+            if time.monotonic() > end:
+                raise LockstepError(f'{", ".join(untimed)} has stopped to follow simulated time')
+            # A node that is destroyed loses its entities one by one.
+            time.sleep(PERIOD)
+        if gone:
             raise LockstepError(
                 f'{", ".join(gone)} was destroyed, or created anew, while {self.child.title} runs: what '
                 'is sent meanwhile would be lost or not, from run to run. In lockstep a process keeps '
                 'its nodes until it ends; Kill, or stop() and start(), create them anew'
             )
-        if untimed := self._untimed():
-            raise LockstepError(f'{", ".join(untimed)} has stopped to follow simulated time')
-        self._marks = marks
+
+    def _gone(self) -> list[str]:
+        """Return the nodes that were destroyed, or created anew, since this was last asked."""
+        there = {graph.full_name for graph in graphs.nodes_beside(self._outside)}
+        marks = graphs.marks(self._outside)
+        anew = {name for name, mark in marks.items() if self._marks.get(name, mark) != mark}
+        self._marks = {**self._marks, **marks}
+        return sorted(name for name in self._stand_ins if name in anew or name not in there)
 
     def _not_discovered(self) -> str:
         waited = f'within {self._command.timeout:g} s (timeout=)'
