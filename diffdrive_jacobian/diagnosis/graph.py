@@ -152,8 +152,8 @@ def check_topics(graph: Graph) -> Iterator[Problem]:
         if count > 1:
             yield Problem(
                 f'{count} nodes have the name {name}',
-                'stop one of them, or give each a name or a namespace of its own (-r __node:=NAME, '
-                f'-r __ns:=/NAME); one that was killed disappears within 20 s; {OF_SOMEBODY_ELSE}',
+                'stop one of them, or give each a namespace of its own, which its topics then have, too '
+                f'(-r __ns:=/NAME); one that was killed disappears within 20 s; {OF_SOMEBODY_ELSE}',
             )
     for topic in graph.topics():
         yield from _check_types(graph, topic)

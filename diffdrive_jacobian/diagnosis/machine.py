@@ -6,6 +6,7 @@ import importlib.util
 import os
 import platform
 import shutil
+import socket
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -50,6 +51,8 @@ class Environment:
     """Where the packages of ROS come from, WHEELS or INSTALLATION, by name."""
     variables: Mapping[str, str] = field(default_factory=dict)
     """The environment variables that are set."""
+    loopback: bool = True
+    """Whether the loopback interface is up."""
     rmw_missing: bool = False
     """Whether the implementation in RMW_IMPLEMENTATION is not installed."""
 
@@ -80,8 +83,19 @@ def environment() -> Environment:
         versions=versions,
         sources=sources,
         variables={name: os.environ[name] for name in VARIABLES if name in os.environ},
+        loopback=_loopback_is_up(),
         rmw_missing=_rmw_missing(wheels=sources.get('rclpy') == WHEELS),
     )
+
+
+def _loopback_is_up() -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unused:
+        try:
+            # Connecting a UDP socket sends nothing. It fails if there is no route.
+            unused.connect(('127.0.0.1', 1))
+        except OSError:
+            return False
+    return True
 
 
 def _rmw_missing(*, wheels: bool) -> bool:
@@ -205,6 +219,11 @@ def _check_discovery(found: Environment) -> Iterator[Problem]:
         yield Problem(
             'ROS_AUTOMATIC_DISCOVERY_RANGE is OFF: no other process is found',
             'export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or SUBNET for other machines',
+        )
+    if not found.loopback:
+        yield Problem(
+            'the loopback interface is down: processes on this machine do not find each other',
+            'ip link set lo up',
         )
     if found.variables.get('ROS_DISCOVERY_SERVER'):
         yield Problem(

@@ -285,8 +285,8 @@ class Selection:
 
 
 OF_SOMEBODY_ELSE = (
-    'one of somebody else, perhaps on another machine of this network, is not met with '
-    'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or with a ROS_DOMAIN_ID of your own'
+    "if it is somebody else's, a ROS_DOMAIN_ID of your own keeps it away, or, if it is on another "
+    'machine of this network, ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST'
 )
 """What to do about a second node of the same name."""
 

@@ -164,10 +164,10 @@ def boolean(name: str, value: Any) -> bool:
     return fields.boolean(name, bool(value) if isinstance(value, np.bool_) else value)
 
 
-def function(name: str, value: Any) -> Any:
-    """Require a callable object."""
+def function(name: str, value: Any, allowed: str = 'a function') -> Any:
+    """Require a callable object. An error says what is `allowed`."""
     if not callable(value):
-        raise ValueError(f'{name} must be a function, got {short(value)}')
+        raise ValueError(f'{name} must be {allowed}, got {short(value)}')
     return value
 
 

@@ -81,7 +81,7 @@ class Batch:
                 raise ValueError(f'law: {error}') from None
         if isinstance(law, Controller):
             self.state, law = law.state, law.law
-        self.law: Law = function('law', law)
+        self.law: Law = function('law', law, 'a function, a Controller, or the name of one')
         # The law of components without checks, where it is a `formula`.
         self.equation: Law | None = getattr(law, 'formula', None)
         self.arrival: Arrival = instance('arrival', Arrival() if arrival is None else arrival, Arrival)

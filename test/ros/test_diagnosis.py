@@ -127,7 +127,7 @@ def test_topics_that_do_not_fit_are_named_with_a_remedy():
         check(check_topics(graph(*endpoints)), words, problems)
     twice = graph(*PAIR, nodes=(*NODES, NODES[0]))
     check(check_topics(twice), '2 nodes have the name /go_to_goal')
-    check(check_topics(twice), 'perhaps on another machine of this network')
+    check(check_topics(twice), 'a ROS_DOMAIN_ID of your own keeps it away')
 
 
 def test_wheels_that_differ_are_a_problem():
@@ -256,6 +256,7 @@ INSTALLATIONS = {
     'two installations of ROS are mixed: ': {'sources': {**SOURCES, 'rclpy': INSTALLATION}},
     'there is no rclpy, geometry_msgs': {'sources': {}},
     'rclpy 9.1.0 is not that of ROS 2 Jazzy': {'versions': {'rclpy': '9.1.0'}},
+    'the loopback interface is down': {'loopback': False},
     'is rmw_x, which is not installed': {
         'rmw_missing': True,
         'variables': {'RMW_IMPLEMENTATION': 'rmw_x'},
@@ -286,6 +287,7 @@ def test_the_environment_of_the_tests_is_found(monkeypatch):
     here = environment()
     assert set(here.sources) == set(ROS_PACKAGES)
     assert len(set(here.sources.values())) == 1
+    assert here.loopback
     assert not here.rmw_missing
     monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_nobody_has')
     assert environment().rmw_missing
