@@ -31,7 +31,7 @@ from diffdrive_jacobian.kinematics.planar_arm import integrate_joints
 from diffdrive_jacobian.kinematics.spatial import pose_vector, pose_vector_difference
 from diffdrive_jacobian.numerics.checks import array, finite, floats
 from diffdrive_jacobian.numerics.elementary import cos, product, sin
-from diffdrive_jacobian.numerics.fields import integer, one_of
+from diffdrive_jacobian.numerics.fields import integer, one_of, short
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 __all__ = ['IIWA', 'PANDA', 'UR5', 'SpatialArm']
@@ -150,12 +150,12 @@ class SpatialArm:
         given = {'a': a, 'alpha': alpha, 'd': d, 'theta': theta}
         values = {name: floats(name, value) for name, value in given.items()}
         shapes = {value.shape for value in values.values() if value.ndim}
-        if len(shapes) != 1 or any(len(shape) > 1 for shape in shapes):
+        if len(shapes) != 1 or any(len(shape) > 1 or shape == (0,) for shape in shapes):
             found = ', '.join(f'{name} {value.shape}' for name, value in values.items())
-            raise ValueError(f'a, alpha, d and theta must have one shape (n,), got {found}')
+            raise ValueError(f'a, alpha, d and theta must have one shape (n,), with n >= 1, got {found}')
         ((n,),) = shapes
         slides = np.zeros(n)
-        for joint in prismatic:
+        for joint in np.atleast_1d(prismatic).tolist():
             slides[integer('prismatic', joint, 0, n - 1)] = 1.0
         for name, value in {**values, 'slides': slides}.items():
             finite(name, value)
@@ -245,7 +245,12 @@ def _read_only(values: ArrayLike, n: int) -> NDArray[np.float64]:
 def _pair(
     limits: tuple[ArrayLike, ArrayLike], n: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    lower, upper = (_read_only(floats('limits', side), n) for side in limits)
+    sides = [floats('limits', side) for side in limits] if np.iterable(limits) else []
+    if len(sides) != 2 or not {side.shape for side in sides} <= {(), (n,)}:
+        raise ValueError(
+            f'limits must be a lower and an upper one, numbers or of shape ({n},), got {short(limits)}'
+        )
+    lower, upper = (_read_only(side, n) for side in sides)
     if not np.all(lower <= upper):
         raise ValueError(f'limits must have lower <= upper, got {lower.tolist()} and {upper.tolist()}')
     return lower, upper

@@ -30,6 +30,9 @@ SIDE = {'elev': 18.0, 'azim': -25.0}
 
 # --- One configuration
 
+SMALLEST, LARGEST = 1e-6, 1e6
+"""Sizes of arms that can be drawn (m)."""
+
 
 @picture
 def arm_at(arm: PlanarArm | SpatialArm | None = None, q: ArrayLike | None = None) -> Figure:
@@ -42,7 +45,7 @@ def arm_at(arm: PlanarArm | SpatialArm | None = None, q: ArrayLike | None = None
         q: Its joints, shape (n,) (rad, or m where a joint slides). None: 0.5 each.
 
     Raises:
-        ValueError: q has another shape.
+        ValueError: q has another shape, or the arm is too small or too large to be drawn.
     """
     from matplotlib.figure import Figure
 
@@ -55,6 +58,8 @@ def arm_at(arm: PlanarArm | SpatialArm | None = None, q: ArrayLike | None = None
     drawing = Figure(figsize=(5.4, 4.6), layout='constrained')
     axes: Any = drawing.add_subplot(projection='3d' if in_space else None)
     axes.plot(*joints.T, 'o-', color='0.35', lw=2.6, ms=5.0, solid_capstyle='round')
+    if not SMALLEST <= (size := float(np.max(np.abs(joints)))) <= LARGEST:
+        raise ValueError(f'an arm to draw must have a size of {SMALLEST:g} to {LARGEST:g} m: {size:g}')
     reach = float(np.sum(np.linalg.norm(np.diff(joints, axis=0), axis=-1)))
     for ellipsoid, name, unit, style in (
         (iv.velocity_ellipsoid(J), r'velocities, $|\dot q| \leq 1$', 'm/s', {'color': BLUE, 'ls': '-'}),
@@ -63,7 +68,8 @@ def arm_at(arm: PlanarArm | SpatialArm | None = None, q: ArrayLike | None = None
         finite = ellipsoid.semi_axes[np.isfinite(ellipsoid.semi_axes)]
         scale = SHARE * reach / float(np.max(finite, initial=1e-300))
         _draw_ellipsoid(axes, joints[-1], ellipsoid, scale, style)
-        axes.plot([], [], label=f'{name} ({scale:.2g} m for 1 {unit})', lw=1.6, **style)
+        cut = '' if len(finite) == len(ellipsoid.semi_axes) else '; infinite, cut off'
+        axes.plot([], [], label=f'{name} ({scale:.2g} m for 1 {unit}{cut})', lw=1.6, **style)
     axes.set(xlabel='x [m]', ylabel='y [m]')
     axes.set_aspect('equal', adjustable='datalim')
     if in_space:

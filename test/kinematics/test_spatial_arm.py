@@ -229,9 +229,9 @@ def test_the_jacobian_gives_the_gradient_of_the_error():
     [
         (
             {'a': [1.0, 2.0], 'alpha': [0.0], 'd': 0.0},
-            r'must have one shape \(n,\), got a \(2,\), alpha \(1,\)',
+            r'must have one shape \(n,\), with n >= 1, got a \(2,\), alpha \(1,\)',
         ),
-        ({'a': 0.0, 'alpha': 0.0, 'd': 0.0}, r'must have one shape \(n,\), got a \(\)'),
+        ({'a': 0.0, 'alpha': 0.0, 'd': 0.0}, r'must have one shape \(n,\), with n >= 1, got a \(\)'),
         ({'a': [[1.0]], 'alpha': 0.0, 'd': 0.0}, 'must have one shape'),
         ({'a': [np.nan], 'alpha': 0.0, 'd': 0.0}, 'a must be finite'),
         ({'a': ['x'], 'alpha': 0.0, 'd': 0.0}, 'a must'),
@@ -240,6 +240,13 @@ def test_the_jacobian_gives_the_gradient_of_the_error():
             'prismatic must be an integer from 0 to 0',
         ),
         ({'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': (1.0, -1.0)}, 'limits must have lower <= upper'),
+        (
+            {'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': [[-1.0, 1.0]]},
+            'limits must be a lower and an upper',
+        ),
+        ({'a': [1.0, 1.0], 'alpha': 0.0, 'd': 0.0, 'limits': ([1.0], 2.0)}, r'of shape \(2,\), got'),
+        ({'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': 1.0}, 'limits must be a lower and an upper'),
+        ({'a': [], 'alpha': [], 'd': []}, r'one shape \(n,\), with n >= 1'),
     ],
 )
 def test_wrong_parameters_are_named(arguments, words):
