@@ -59,7 +59,9 @@ def arm_at(arm: PlanarArm | SpatialArm | None = None, q: ArrayLike | None = None
     axes: Any = drawing.add_subplot(projection='3d' if in_space else None)
     axes.plot(*joints.T, 'o-', color='0.35', lw=2.6, ms=5.0, solid_capstyle='round')
     if not SMALLEST <= (size := float(np.max(np.abs(joints)))) <= LARGEST:
-        raise ValueError(f'an arm to draw must have a size of {SMALLEST:g} to {LARGEST:g} m: {size:g}')
+        raise ValueError(
+            f'the size of an arm to draw must be {SMALLEST:g} to {LARGEST:g} m, got {size:g}'
+        )
     reach = float(np.sum(np.linalg.norm(np.diff(joints, axis=0), axis=-1)))
     for ellipsoid, name, unit, style in (
         (iv.velocity_ellipsoid(J), r'velocities, $|\dot q| \leq 1$', 'm/s', {'color': BLUE, 'ls': '-'}),

@@ -187,7 +187,7 @@ def test_the_elbow_moves_and_damping_bounds_the_joints():
         (('geometry', '-o', 'a.jpg'), 2, "the picture must end in .png, .svg, .pdf, got 'a.jpg'"),
         (('geometry', '--q', '1'), 2, '--q has no effect with geometry, but with arm_at'),
         (('arm_at', '--q', '1'), 2, r'q must have shape \(..., 2\), got \(1,\)'),
-        (('arm_at', '--lengths', '1e300'), 2, 'an arm to draw must have a size of 1e-06 to 1e'),
+        (('arm_at', '--lengths', '1e300'), 2, 'the size of an arm to draw must be 1e-06 to 1e'),
         (('arm_at', '--lengths', '1', '--dh', 'a.yaml'), 2, '--lengths and --dh exclude each other'),
         (('arm_at', '--dh', 'a.yaml'), 2, '--dh a.yaml cannot be read: No such file'),
         (('arm_ellipses', '--lengths', '1', '1', '1'), 2, 'is for an arm of 2 links, this one has 3'),
