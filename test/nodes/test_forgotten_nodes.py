@@ -172,7 +172,8 @@ def test_a_controller_of_the_same_name_is_perhaps_that_of_somebody_else(lockstep
     assert mine.waypoint is None
     text = said(capfd)
     assert 'another /go_to_goal drives the robot by /cmd_vel, so the goal is canceled' in text
-    assert 'with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or with a ROS_DOMAIN_ID of your own' in text
+    assert 'ROS_DOMAIN_ID of your own keeps it away' in text
+    assert 'machine of this network, ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST' in text
 
 
 @pytest.mark.parametrize('command', [Twist, TwistStamped])
