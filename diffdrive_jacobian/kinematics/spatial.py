@@ -68,7 +68,7 @@ def pose_vector_difference(target: Vector, pose: Vector) -> Entries:
     """Return the error of poses in space, for `solve(..., difference=pose_vector_difference)`.
 
     Of pose vectors, shape (..., 6) (m, rad), it is the translation `p_target - p`, and axis times angle
-    of the rotation `R_target R^T`, both in the axes of the base. `J^T` of it, with J in these axes, is
+    of the rotation `R_target R^T`, both in the axes of the base. `-J^T` of it, with J in these axes, is
     the gradient of half its square.
     """
     w, x, y, z = _quaternion(*target[3:])

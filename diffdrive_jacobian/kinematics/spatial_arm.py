@@ -209,7 +209,8 @@ class SpatialArm:
         """Search for joints at which the end effector is at a pose, from a start (D, 6).
 
         The error is what is missing in the axes of the base: the translation, and axis times angle of
-        the rotation, six entries for the `mask` (m, rad).
+        the rotation, six entries for the `mask` (m, rad). With a mask of only some of the three entries
+        of the rotation a search may end before its error is least.
 
         Args:
             target: Poses, shape (..., 4, 4).
