@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
+from ruamel.yaml.events import AliasEvent
 
 YAML_ERRORS = (YAMLError, ValueError, RecursionError, OverflowError)
 """What `load_yaml` raises on a text that is not valid YAML."""
 
 
-def load_yaml(source: Path | str) -> Any:
+def load_yaml(source: Path | str, *, aliases: bool = False) -> Any:
     """Load YAML from a file (a path) or a text.
+
+    Args:
+        source: The file or the text.
+        aliases: Whether a value may be repeated by its name. ROS does not allow it in files of
+            parameters, and a short file could become of any size.
 
     Returns:
         Dictionaries, lists, strings, numbers, dates and None.
@@ -23,4 +30,9 @@ def load_yaml(source: Path | str) -> Any:
         OSError: The file cannot be read.
     """
     text = source.read_text(encoding='utf-8') if isinstance(source, Path) else source
+    if not aliases and re.search(r'(^|[\s,[{])\*\S', text):
+        for event in YAML(typ='safe').parse(text):
+            if isinstance(event, AliasEvent):
+                line = event.start_mark.line + 1
+                raise ValueError(f'aliases are not allowed, got *{event.anchor} in line {line}')
     return YAML(typ='safe').load(text)

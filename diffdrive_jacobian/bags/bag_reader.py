@@ -55,7 +55,7 @@ def check_metadata(path: Path) -> None:
     """
     check_regular(path)
     try:
-        found = load_yaml(path)
+        found = load_yaml(path, aliases=True)
     except YAML_ERRORS as error:
         raise MetadataError(f'metadata.yaml is not valid YAML: {printable(error, 120)}') from error
     with _reported():

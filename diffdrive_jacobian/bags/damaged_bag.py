@@ -329,7 +329,7 @@ def _metadata(source: Path | str) -> tuple[dict[str, Any], str]:
     try:
         if isinstance(source, Path):
             check_regular(source)
-        found = load_yaml(source)
+        found = load_yaml(source, aliases=True)
     except NotARegularFileError as error:
         return {}, str(error)
     except (FileNotFoundError, *YAML_ERRORS):

@@ -54,7 +54,7 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 Function = Callable[[Floats], ArrayLike]
-Difference = Callable[[Floats, Floats], ArrayLike]
+OfTwo = Callable[[Floats, Floats], ArrayLike]
 
 METHODS = ('newton', 'transpose', 'levenberg_marquardt')
 """Names of the methods that solve for a configuration."""
@@ -68,6 +68,8 @@ SECOND_ORDER_AFTER = 10
 """Steps of a search after which `levenberg_marquardt` adds the second derivatives of forward."""
 STALLED_AFTER = 30
 """Steps in a row without a lower error after which a method that lets the error grow is restarted."""
+LONG_AFTER = 50
+"""Steps after which a search without second derivatives is restarted: it converges slowly if at all."""
 AGREEING = 3
 """Searches that end at the same least error, after which a target is taken for unreachable.
 
@@ -128,10 +130,10 @@ def solve(
     tolerance: float = 1e-6,
     max_iterations: int = 500,
     damping: float = 0.1,
-    difference: Difference | None = None,
+    difference: OfTwo | None = None,
+    difference_jacobian: OfTwo | None = None,
     alpha: float | None = None,
     step_tolerance: float = 0.0,
-    second_order: bool = True,
     limits: tuple[ArrayLike, ArrayLike] | None = None,
     restarts: int = 20,
     seed: int | np.random.Generator | None = 0,
@@ -139,8 +141,9 @@ def solve(
     """Find joints at which forward is the target, for one target or for thousands (C, D).
 
     A search ends when the target is reached, when to first order no joint lowers its error, when a step
-    is too small, and, where steps may raise the error (`newton`, `transpose` with alpha), after 30 steps
-    in a row without a lower one. It is then restarted: from random joints within the limits, or, if it
+    is too small, and, while restarts are left, where steps may raise the error (`newton`, `transpose`
+    with alpha) after 30 steps in a row without a lower one, and for `levenberg_marquardt` without second
+    derivatives after 50 steps. It is then restarted: from random joints within the limits, or, if it
     could not take a single step, a tenth of the distance from there. All targets use the same restart
     points.
 
@@ -149,7 +152,8 @@ def solve(
     searches ended at the same lowest error: that is taken for the distance of the nearest reachable
     point. (Limits leave local minima, in which many searches end alike.) `levenberg_marquardt`, and
     `transpose` without alpha, never let the error grow within a search, and end at a point without a
-    nearer one around it if the steps suffice. The result is the best q of all searches.
+    nearer one around it if the steps suffice. (With a `difference_jacobian` that point is nearest to a
+    part in a thousand.) The result is the best q of all searches.
 
     Args:
         forward: Maps joints of shape (k, n) to what they reach, shape (k, m). Called only for the
@@ -166,14 +170,15 @@ def solve(
         damping: The first lambda of `levenberg_marquardt`, in the unit of `J^T M J`.
         difference: Returns the error, shape (k, m), of targets and what is reached, as `pose_difference`
             does; None subtracts.
+        difference_jacobian: Returns minus the derivative of the error by the joints, shape (k, m, n), of
+            errors and of what jacobian returns, for a jacobian that is not the derivative of forward:
+            one that maps to angular velocities. `levenberg_marquardt` then adds no second derivatives.
         alpha: The fixed factor of `transpose` (D). The error falls for alpha below `2 / s^2`, s the
             largest singular value of `sqrt(M) J`; far below, it takes many steps; above, the search may
             diverge. None finds a factor for every step by line search.
         step_tolerance: A search ends after a step `|dq|` of this or less (D), in the unit of q; whether
             the target is reached depends on the error alone. Zero ends it when q does not change in
             double precision.
-        second_order: Whether `levenberg_marquardt` adds the second derivatives of forward after ten
-            steps. False if jacobian is no derivative of forward, but maps to angular velocities.
         limits: Lower and upper limits of the joints, each of shape (n,) or one for all. Infinite for
             none. Steps end at them.
         restarts: Largest number of restarts. 0: the search starts from q0 only.
@@ -202,10 +207,11 @@ def solve(
         forward=forward,
         jacobian=jacobian,
         difference=np.subtract if difference is None else difference,
+        difference_jacobian=difference_jacobian,
         rows=weights > 0.0,
         roots=np.sqrt(weights[weights > 0.0]),
         targets=np.broadcast_to(target, (*batch, m)).reshape(-1, m),
-        limits=None if limits is None else _limits(limits, n),
+        limits=None if limits is None else joint_limits(limits, n),
     )
     search = Search(
         task=task,
@@ -215,7 +221,6 @@ def solve(
         step_tolerance=number('step_tolerance', step_tolerance, not_negative),
         damping=number('damping', damping, positive),
         alpha=alpha,
-        second_order=bool(second_order),
         restarts=int(restarts),
         seed=seed,
     )
@@ -238,15 +243,17 @@ def _weights(mask: ArrayLike | None, m: int) -> Floats:
     return weights
 
 
-def _limits(limits: tuple[ArrayLike, ArrayLike], n: int) -> tuple[Floats, Floats]:
-    """Return lower and upper limits, shape (n,) each."""
+def joint_limits(limits: tuple[ArrayLike, ArrayLike], n: int) -> tuple[Floats, Floats]:
+    """Return lower and upper limits, shape (n,) each, or raise ValueError."""
     try:
         sides = [floats(name, side) for name, side in zip(('lower', 'upper'), limits, strict=True)]
     except (TypeError, ValueError) as error:
         raise ValueError(f'limits must be a pair (lower, upper): {error}') from None
     for side in sides:
         if side.shape not in ((), (n,)):
-            raise ValueError(f'limits must have shape () or ({n},), as q0 has n = {n}, got {side.shape}')
+            raise ValueError(
+                f'limits must have shape () or ({n},), one for each joint, got {side.shape}'
+            )
     lower, upper = (np.broadcast_to(side, n) for side in sides)
     # Not for NaN either.
     if not np.all((lower <= upper) & (lower < np.inf) & (upper > -np.inf)):
@@ -265,36 +272,41 @@ class Task:
 
     forward: Function
     jacobian: Function | None
-    difference: Difference
+    difference: OfTwo
+    difference_jacobian: OfTwo | None
     rows: Flags
     roots: Floats
     """The task's entries with a weight above zero, and the square roots of these weights."""
     targets: Floats
     limits: tuple[Floats, Floats] | None
 
-    def errors(self, q: Floats, which: Integers) -> tuple[Floats, Floats]:
-        """Return the errors, shape (m, k), of joints of shape (k, n), and their norms.
+    def errors(self, q: Floats, which: Integers) -> tuple[Floats, Floats, Floats]:
+        """Return what joints of shape (k, n) miss, shape (k, m), the errors, (m, k), and their norms.
 
         NaN where forward is not finite.
         """
         target = self.targets[which]
-        e = np.full_like(target, np.nan)
+        missing = np.full_like(target, np.nan)
         if len(q):
             # A copy, as the function may write to its argument.
             reached = _returned('forward', self.forward(q.copy()), target.shape, q)
             finite = np.isfinite(reached).all(axis=-1, keepdims=True)
             if finite.any():
                 reached = np.where(finite, reached, target)
-                e = np.where(finite, self._differences(target, reached, q), np.nan)
-        e = self._weighted(e)
-        return e, norm(e)
+                missing = np.where(finite, self._differences(target, reached, q), np.nan)
+        e = self._weighted(missing)
+        return missing, e, norm(e)
 
-    def derivatives(self, q: Floats) -> Floats:
-        """Return the Jacobians, shape (m, n, k), of joints of shape (k, n)."""
+    def derivatives(self, q: Floats, missing: Floats | None = None) -> Floats:
+        """Return the Jacobians, shape (m, n, k), of joints of shape (k, n) that miss these errors."""
         shape = (len(q), len(self.rows), q.shape[-1])
         if self.jacobian is None:
-            return self._weighted(self._central_differences(q, shape))
-        return self._weighted(_returned('jacobian', self.jacobian(q.copy()), shape, q))
+            J = self._central_differences(q, shape)
+        else:
+            J = _returned('jacobian', self.jacobian(q.copy()), shape, q)
+        if self.difference_jacobian is not None and missing is not None:
+            J = _returned('difference_jacobian', self.difference_jacobian(missing, J), shape, q)
+        return self._weighted(J)
 
     def around(self, q: Floats, step: float) -> tuple[Floats, Floats]:
         """Return points a step up and down each joint, (k, 2, n, n), and how far apart, (k, n)."""
@@ -390,6 +402,7 @@ class _Open(NamedTuple):
 
     which: Integers
     q: Floats
+    missing: Floats
     e: Floats
     error: Floats
     J: Floats
@@ -438,19 +451,18 @@ class Search:
     step_tolerance: float
     damping: float
     alpha: float | None
-    second_order: bool
     restarts: int
     seed: int | np.random.Generator | None
 
     def run(self, q: Floats, max_iterations: int) -> Outcome:
         """Search from q, shape (k, n), and from restart points, in max_iterations steps per target."""
         q, which = self.task.within_limits(q), np.arange(len(q))
-        e, error = self.task.errors(q, which)
-        q = entries_first(q, 1, 1)
+        missing, e, error = self.task.errors(q, which)
+        q, missing = entries_first(q, 1, 1), entries_first(missing, 1, 1)
         found = Outcome.of(q, error)
         J: Floats = np.zeros((len(e), self.joints, len(which)))
         factor = np.full(len(which), self._first_factor)
-        still = _Open(which, q, e, error, J, factor)
+        still = _Open(which, q, missing, e, error, J, factor)
         still = still.keep(np.isfinite(error) & (error > self.tolerance))
         ended: Flags = np.zeros(len(still.which), dtype=np.bool_)
         self._differentiate(still, ~ended)
@@ -487,9 +499,17 @@ class Search:
     def _differentiate(self, still: _Open, where: Flags) -> None:
         """Write the Jacobians of these rows."""
         if where.any():
-            still.J[..., where] = self.task.derivatives(still.q[:, where].T)
+            still.J[..., where] = self.task.derivatives(still.q[:, where].T, still.missing[:, where].T)
 
     # --- Steps
+
+    @property
+    def _longest(self) -> int | None:
+        """Steps after which a search is restarted: of a whole search, or without a lower error."""
+        if not self._descends:
+            return STALLED_AFTER
+        second_order = self.task.difference_jacobian is None
+        return None if self.method == 'transpose' or second_order else LONG_AFTER
 
     @property
     def _descends(self) -> bool:
@@ -509,7 +529,7 @@ class Search:
             return transpose_step(JT_e, alpha)
         step = levenberg_marquardt_step(J, JT_e, still.factor)
         late = found.iterations[still.which] - found.began[still.which] >= SECOND_ORDER_AFTER
-        if self.second_order and late.any():
+        if self.task.difference_jacobian is None and late.any():
             step[:, late] = self._second_order_step(still._replace(J=J).keep(late), JT_e[:, late])
         return step
 
@@ -539,7 +559,7 @@ class Search:
         self, still: _Open, found: Outcome, JT_e: Floats, again: Flags, tried: Floats
     ) -> tuple[_Open, Flags]:
         """Take steps or reject them. Return the open rows, and whose search ended."""
-        e, error = self.task.errors(tried.T, still.which)
+        missing, e, error = self.task.errors(tried.T, still.which)
         by = tried - still.q
         change = (error - still.error) * (error + still.error)
         slope, length = dot(by, JT_e), norm(by)
@@ -557,15 +577,17 @@ class Search:
         taken, ended = taken | (again & finite), ended & ~again
         still = still._replace(
             q=np.where(taken, tried, still.q),
+            missing=np.where(taken, missing.T, still.missing),
             e=np.where(taken, e, still.e),
             error=np.where(taken, error, still.error),
             factor=np.where(again, self._first_factor, factor),
         )
         found.iterations[still.which] += 1
         self._record(still, found)
-        if not self._descends:
-            idle = found.iterations[still.which] - found.lowered[still.which] >= STALLED_AFTER
-            ended |= idle & (found.restarts[still.which] < self.restarts)
+        if (longest := self._longest) is not None:
+            since = found.began if self._descends else found.lowered
+            long = found.iterations[still.which] - since[still.which] >= longest
+            ended |= long & (found.restarts[still.which] < self.restarts)
         closed = ~finite | (still.error <= self.tolerance)
         self._differentiate(still, taken & ~closed & ~ended)
         return still.keep(~closed), ended[~closed]

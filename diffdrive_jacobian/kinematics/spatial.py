@@ -4,7 +4,8 @@ A pose is a homogeneous transform `[[R, p], [0, 1]]`, shape (4, 4), with the rot
 position p (m). Everything broadcasts over leading axes. Other matrices raise ValueError. In the plane
 the same displacement is `se2.compose(se2.inverse(pose), target)`.
 
-Source: document D, 6; doc/mathematics.md, "Inverse kinematics".
+Source: document D, 6; the Jacobians of SO(3): J. Sola, J. Deray, D. Atchuthan, *A Micro Lie Theory for
+State Estimation in Robotics*, 2018, (145) and (146); doc/mathematics.md, "Inverse kinematics".
 """
 
 from __future__ import annotations
@@ -16,15 +17,22 @@ import numpy as np
 from diffdrive_jacobian.kinematics.singular_values import product, times, transposed
 from diffdrive_jacobian.numerics.checks import finite
 from diffdrive_jacobian.numerics.elementary import cos, hypot, sinc
-from diffdrive_jacobian.numerics.formula import Array, Entries, Number, Vector, formula
+from diffdrive_jacobian.numerics.formula import Array, Entries, Number, Rows, Vector, formula
 
-__all__ = ['pose_vector', 'pose_vector_difference', 'spatial_displacement']
+__all__ = [
+    'pose_vector',
+    'pose_vector_difference',
+    'pose_vector_difference_jacobian',
+    'pose_vector_displacement',
+    'spatial_displacement',
+    'spatial_displacement_jacobian',
+]
 
 ROUNDING = 1e-6
 """Largest deviation of `R^T R` from the identity in the norm of Frobenius."""
 
 
-def _rigid(name: str, T: Array) -> None:
+def rigid(name: str, T: Array) -> None:
     """Require homogeneous transforms, shape (..., 4, 4)."""
     finite(name, T)
     R = T[..., :3, :3]
@@ -39,7 +47,7 @@ def _rigid(name: str, T: Array) -> None:
         )
 
 
-@formula('(4,4),(4,4) -> (6)', T=_rigid, T_desired=_rigid)
+@formula('(4,4),(4,4) -> (6)', T=rigid, T_desired=rigid)
 def spatial_displacement(T: Any, T_desired: Any) -> Array:
     """Return the displacement from a pose to another one: `Delta = (t, v theta)` (D, 6).
 
@@ -53,7 +61,7 @@ def spatial_displacement(T: Any, T_desired: Any) -> Array:
     return np.concatenate([t, _rotation_vector(product(R_transposed, T_desired[:3, :3]))])
 
 
-@formula('(4,4) -> (6)', T=_rigid)
+@formula('(4,4) -> (6)', T=rigid)
 def pose_vector(T: Any) -> Array:
     """Return the position of a pose, and its rotation as axis times angle.
 
@@ -68,8 +76,7 @@ def pose_vector_difference(target: Vector, pose: Vector) -> Entries:
     """Return the error of poses in space, for `solve(..., difference=pose_vector_difference)`.
 
     Of pose vectors, shape (..., 6) (m, rad), it is the translation `p_target - p`, and axis times angle
-    of the rotation `R_target R^T`, both in the axes of the base. `-J^T` of it, with J in these axes, is
-    the gradient of half its square.
+    of the rotation `R_target R^T`, both in the axes of the base.
     """
     w, x, y, z = _quaternion(*target[3:])
     w_is, *v = _quaternion(*pose[3:])
@@ -82,6 +89,61 @@ def pose_vector_difference(target: Vector, pose: Vector) -> Entries:
     ]
     missing = [there - here for there, here in zip(target[:3], pose[:3], strict=True)]
     return [*missing, *_logarithm(np.array(np.broadcast_arrays(*rotation)))]
+
+
+@formula('(6),(6,n) -> (6,n)')
+def pose_vector_difference_jacobian(e: Any, J: Any) -> Rows:
+    """Return minus the derivative by the joints of the error that `pose_vector_difference` gives.
+
+    For errors e, shape (..., 6), and Jacobians in the axes of the base, linear above angular, shape
+    (..., 6, n), it has the shape (..., 6, n).
+    """
+    return [*J[:3], *_left_jacobian_inverse(-e[3:], J[3:])]
+
+
+@formula('(6),(6) -> (6)')
+def pose_vector_displacement(target: Vector, pose: Vector) -> Entries:
+    """Return what `spatial_displacement` returns, of pose vectors, shape (..., 6) (m, rad)."""
+    e = pose_vector_difference.formula(target, pose)
+    back = _quaternion(*(-component for component in pose[3:]))
+    return [*_rotated(back, e[:3]), *_rotated(back, e[3:])]
+
+
+@formula('(6),(6,n) -> (6,n)')
+def spatial_displacement_jacobian(Delta: Any, J: Any) -> Rows:
+    """Return minus the derivative by the joints of the displacement that `spatial_displacement` gives.
+
+    For displacements, shape (..., 6), and Jacobians in the axes of E, linear above angular, shape (...,
+    6, n), it has the shape (..., 6, n).
+    """
+    # The axes turn, too.
+    return [*(J[:3] - _cross(Delta[:3], J[3:])), *_left_jacobian_inverse(Delta[3:], J[3:])]
+
+
+def _left_jacobian_inverse(v: Array, omega: Array) -> Array:
+    """Return `J_l^-1 omega`, with the left Jacobian of SO(3) at v theta, shapes (3, ...), (3, n, ...).
+
+    `J_l^-1 = I - [v]/2 + (1 - theta/2 cot(theta/2)) [v]^2 / theta^2`, where [v] is the cross product
+    with v theta. The right Jacobian of v theta is the left one of -v theta.
+    """
+    square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    half = 0.5 * np.sqrt(square)
+    factor = (1.0 - cos(half) / sinc(half)) / (square + (square == 0.0))
+    turned = _cross(v, omega)
+    return np.asarray(omega - 0.5 * turned + factor * _cross(v, turned))
+
+
+def _cross(v: Vector, w: Vector) -> Array:
+    """Return the cross product of a vector with a vector or columns, shapes (3, ...), (3, n, ...)."""
+    (x, y, z), (a, b, c) = v, w
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a])
+
+
+def _rotated(q: Entries, vector: Entries) -> Array:
+    """Return a vector, rotated by a unit quaternion."""
+    w, *u = q
+    across = 2.0 * _cross(u, vector)
+    return np.asarray(vector + w * across + _cross(u, across))
 
 
 def _quaternion(x: Number, y: Number, z: Number) -> Entries:

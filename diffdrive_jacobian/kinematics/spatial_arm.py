@@ -26,18 +26,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics.inverse_kinematics import IKResult, solve
+from diffdrive_jacobian.kinematics.inverse_kinematics import IKResult, joint_limits, solve
 from diffdrive_jacobian.kinematics.planar_arm import integrate_joints
-from diffdrive_jacobian.kinematics.spatial import pose_vector, pose_vector_difference
+from diffdrive_jacobian.kinematics.spatial import (
+    pose_vector,
+    pose_vector_difference,
+    pose_vector_difference_jacobian,
+    pose_vector_displacement,
+    rigid,
+    spatial_displacement_jacobian,
+)
 from diffdrive_jacobian.numerics.checks import array, finite, floats
 from diffdrive_jacobian.numerics.elementary import cos, product, sin
-from diffdrive_jacobian.numerics.fields import integer, one_of, short
+from diffdrive_jacobian.numerics.fields import integer, one_of
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 __all__ = ['IIWA', 'PANDA', 'UR5', 'SpatialArm']
 
-FRAMES = ('base', 'end')
-"""Axes in which velocities and wrenches are given."""
+ERRORS = {
+    'base': (pose_vector_difference, pose_vector_difference_jacobian),
+    'end': (pose_vector_displacement, spatial_displacement_jacobian),
+}
+"""Axes in which velocities and errors are given, with the errors and their derivatives."""
 IDENTITY: Rows = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 
 
@@ -160,7 +170,8 @@ class SpatialArm:
         for name, value in {**values, 'slides': slides}.items():
             finite(name, value)
             object.__setattr__(self, name, _read_only(value, n))
-        object.__setattr__(self, 'limits', None if limits is None else _pair(limits, n))
+        pair = None if limits is None else joint_limits(limits, n)
+        object.__setattr__(self, 'limits', pair and tuple(_read_only(side, n) for side in pair))
 
     @property
     def joints(self) -> int:
@@ -182,7 +193,7 @@ class SpatialArm:
         0]` if it slides. `frame` says in which axes: those of the base, or of E, `[R^T v, R^T omega]`.
         The result has the shape (..., 6, n).
         """
-        one_of(*FRAMES)('frame', frame)
+        one_of(*ERRORS)('frame', frame)
         J = _jacobian(self.a, self.alpha, self.d, self.theta, self.slides, q)
         if frame == 'base':
             return J
@@ -205,30 +216,37 @@ class SpatialArm:
         """
         return integrate_joints(array('q', q, self.joints), q_dot, dt)
 
-    def inverse_kinematics(self, target: ArrayLike, q0: ArrayLike, **options: Any) -> IKResult:
+    def inverse_kinematics(
+        self, target: ArrayLike, q0: ArrayLike, frame: str = 'base', **options: Any
+    ) -> IKResult:
         """Search for joints at which the end effector is at a pose, from a start (D, 6).
 
-        The error is what is missing in the axes of the base: the translation, and axis times angle of
-        the rotation, six entries for the `mask` (m, rad). With a mask of only some of the three entries
-        of the rotation a search may end before its error is least.
+        The error is what is missing: the translation, and axis times angle of the rotation, six entries
+        for the `mask` (m, rad).
 
         Args:
             target: Poses, shape (..., 4, 4).
             q0: Starts of the search, shape (..., n).
+            frame: In which axes the error is, those of the base, or of E, as `spatial_displacement`. A
+                mask of [1, 1, 1, 1, 1, 0] in those of E lets a drill turn about its own z axis.
             options: As for `inverse_kinematics.solve`. By default `limits` are those of the arm, with
                 50 `restarts` and 2000 `max_iterations`.
 
         Raises:
             ValueError: An argument has a wrong shape or value.
         """
+        one_of(*ERRORS)('frame', frame)
+        target, q0 = array('target', target, 4, 4), array('q0', q0, self.joints)
+        rigid('target', target)
+        difference, difference_jacobian = ERRORS[frame]
         return solve(
             lambda q: pose_vector(self.forward_kinematics(q)),
-            self.jacobian,
+            lambda q: self.jacobian(q, frame),
             pose_vector(target),
             q0,
             **{
-                'difference': pose_vector_difference,
-                'second_order': False,
+                'difference': difference,
+                'difference_jacobian': difference_jacobian,
                 'limits': self.limits,
                 'restarts': 50,
                 'max_iterations': 2000,
@@ -241,20 +259,6 @@ def _read_only(values: ArrayLike, n: int) -> NDArray[np.float64]:
     copy = np.array(np.broadcast_to(values, n), dtype=np.float64)
     copy.flags.writeable = False
     return copy
-
-
-def _pair(
-    limits: tuple[ArrayLike, ArrayLike], n: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    sides = [floats('limits', side) for side in limits] if np.iterable(limits) else []
-    if len(sides) != 2 or not {side.shape for side in sides} <= {(), (n,)}:
-        raise ValueError(
-            f'limits must be a lower and an upper one, numbers or of shape ({n},), got {short(limits)}'
-        )
-    lower, upper = (_read_only(side, n) for side in sides)
-    if not np.all(lower <= upper):
-        raise ValueError(f'limits must have lower <= upper, got {lower.tolist()} and {upper.tolist()}')
-    return lower, upper
 
 
 # --- Published robots

@@ -68,8 +68,9 @@ def arm_at(arm: PlanarArm | SpatialArm | None = None, q: ArrayLike | None = None
         (iv.force_ellipsoid(J), r'forces, $|\tau| \leq 1$', 'N', {'color': RED, 'ls': DASHED}),
     ):
         finite = ellipsoid.semi_axes[np.isfinite(ellipsoid.semi_axes)]
-        scale = SHARE * reach / float(np.max(finite, initial=1e-300))
-        _draw_ellipsoid(axes, joints[-1], ellipsoid, scale, style)
+        largest = float(np.max(finite, initial=0.0))
+        scale = SHARE * reach / largest if largest > 0.0 else 1.0
+        _draw_ellipsoid(axes, joints[-1], ellipsoid, scale, SHARE * reach, style)
         cut = '' if len(finite) == len(ellipsoid.semi_axes) else '; infinite, cut off'
         axes.plot([], [], label=f'{name} ({scale:.2g} m for 1 {unit}{cut})', lw=1.6, **style)
     axes.set(xlabel='x [m]', ylabel='y [m]')
@@ -87,18 +88,24 @@ def arm_at(arm: PlanarArm | SpatialArm | None = None, q: ArrayLike | None = None
 
 
 def _draw_ellipsoid(
-    axes: Axes, centre: Array, ellipsoid: Ellipsoid, scale: float, style: dict[str, Any]
+    axes: Axes, centre: Array, ellipsoid: Ellipsoid, scale: float, far: float, style: dict[str, Any]
 ) -> None:
-    """Draw an ellipse, or the three ellipses of an ellipsoid; infinite semi-axes end at the picture."""
+    """Draw an ellipse, or the three of an ellipsoid; an infinite one as two lines that end far away."""
     U, semi_axes = ellipsoid
-    half = scale * np.minimum(semi_axes, 4.0 * np.min(semi_axes) + 1e9 * np.isfinite(semi_axes))
     turn = np.linspace(0.0, 2.0 * np.pi, 100)
     ring = np.stack([np.cos(turn), np.sin(turn)])
-    for first in range(len(half)):
+    # On both sides of the axis that is infinite, the second one.
+    lines = np.array([[1.0, 1.0, np.nan, -1.0, -1.0], [-1.0, 1.0, np.nan, 1.0, -1.0]])
+    for first in range(len(semi_axes)):
         for second in range(first):
             pair = [first, second]
-            curve = centre[:, np.newaxis] + U[:, pair] @ (half[pair, np.newaxis] * ring)
-            axes.plot(*curve, lw=1.6 if len(half) == 2 else 1.0, **style)
+            endless = np.isinf(semi_axes[pair])
+            if endless.all():
+                continue
+            half = np.where(endless, far, scale * semi_axes[pair])
+            curve = lines if endless[1] else lines[::-1] if endless[0] else ring
+            curve = centre[:, np.newaxis] + U[:, pair] @ (half[:, np.newaxis] * curve)
+            axes.plot(*curve, lw=1.6 if len(semi_axes) == 2 else 1.0, **style)
 
 
 # --- Seven joints

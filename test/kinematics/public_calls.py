@@ -79,6 +79,18 @@ BROADCASTING = {
         'target': (*POSE, 0.1, 0.2, 0.3),
         'pose': (*GOAL, 0.5, -0.4, 0.2, 1.0),
     },
+    spatial.pose_vector_displacement: {
+        'target': (*POSE, 0.1, 0.2, 0.3),
+        'pose': (*GOAL, 0.5, -0.4, 0.2, 1.0),
+    },
+    spatial.pose_vector_difference_jacobian: {
+        'e': (*POSE, 0.1, 0.2, 0.3),
+        'J': SPATIAL.jacobian(WHOLE_Q),
+    },
+    spatial.spatial_displacement_jacobian: {
+        'Delta': (*POSE, 0.1, 0.2, 0.3),
+        'J': SPATIAL.jacobian(WHOLE_Q, 'end'),
+    },
     **{call: {'q': WHOLE_Q} for call in (SPATIAL.forward_kinematics, SPATIAL.joint_positions)},
     SPATIAL.jacobian: {'q': WHOLE_Q},
     SPATIAL.joint_torques: {'q': WHOLE_Q, 'wrench': (*POSE, *GOAL, 0.4)},

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian import kinematics
-from diffdrive_jacobian.kinematics import contact, diff_drive, se2
+from diffdrive_jacobian.kinematics import contact, diff_drive, se2, spatial
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.kinematics.differentiation import numerical_jacobian
 from diffdrive_jacobian.kinematics.inverse_kinematics import pose_difference
@@ -20,7 +20,7 @@ from diffdrive_jacobian.kinematics.mobile_manipulator import (
     mobile_manipulator_jacobian,
 )
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm, arm_forward_kinematics, arm_jacobian
-from diffdrive_jacobian.kinematics.spatial_arm import SpatialArm
+from diffdrive_jacobian.kinematics.spatial_arm import PANDA, SpatialArm
 
 COUNT = 100
 STEP = 1e-5
@@ -118,6 +118,22 @@ def of_arms(rng):
         yield 'differentiation.numerical_jacobian', found, J[:10]
 
 
+def of_errors_in_space(rng):
+    q = rng.uniform(-1.5, 1.5, (COUNT, 7))
+    # The rotations that are left are up to half a turn.
+    target = spatial.pose_vector(PANDA.forward_kinematics(q + rng.uniform(-1.2, 1.2, (COUNT, 7))))
+    for frame, of, jacobian in (
+        ('base', spatial.pose_vector_difference, spatial.pose_vector_difference_jacobian),
+        ('end', spatial.pose_vector_displacement, spatial.spatial_displacement_jacobian),
+    ):
+
+        def error(q, target=target[:, np.newaxis], of=of):
+            return of(target, spatial.pose_vector(PANDA.forward_kinematics(q)))
+
+        found = jacobian(error(q[:, np.newaxis])[:, 0], PANDA.jacobian(q, frame))
+        yield f'spatial.{jacobian.__name__}', found, -differences(error, q)
+
+
 def of_mobile_manipulators(rng):
     for links, mount in ((1, (0.0, 0.0)), (3, (0.12, -0.07))):
         arm = PlanarArm(rng.uniform(0.1, 1.0, links))
@@ -171,7 +187,15 @@ def of_secondary_tasks(rng):
     yield 'planar_arm.PlanarArm.clearance_gradient', arm.clearance_gradient(q, obstacle), numeric
 
 
-MODELS = of_a_drive, of_a_wheel, of_exp, of_arms, of_mobile_manipulators, of_secondary_tasks
+MODELS = (
+    of_a_drive,
+    of_a_wheel,
+    of_exp,
+    of_arms,
+    of_errors_in_space,
+    of_mobile_manipulators,
+    of_secondary_tasks,
+)
 
 
 @cache

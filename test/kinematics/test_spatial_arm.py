@@ -12,6 +12,7 @@ from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 from diffdrive_jacobian.kinematics.spatial import (
     pose_vector,
     pose_vector_difference,
+    pose_vector_displacement,
     spatial_displacement,
 )
 from diffdrive_jacobian.kinematics.spatial_arm import IIWA, PANDA, UR5, SpatialArm
@@ -25,6 +26,7 @@ STANFORD = SpatialArm(
 """The arm of Scheinman 1969: its third joint slides."""
 ARMS = {'UR5': UR5, 'Panda': PANDA, 'iiwa': IIWA, 'Stanford': STANFORD}
 every_arm = pytest.mark.parametrize('arm', ARMS.values(), ids=ARMS)
+every_robot = pytest.mark.parametrize('arm', [UR5, PANDA, IIWA], ids=list(ARMS)[:3])
 
 
 def configurations(arm, count=50):
@@ -193,6 +195,53 @@ def test_a_position_alone_is_a_mask():
     np.testing.assert_allclose(UR5.forward_kinematics(result.q)[:3, 3], target[:3, 3], atol=1e-6)
 
 
+MASKS = {
+    'rotations about one axis': [1, 1, 1, 0, 0, 1],
+    'unequal weights': [1, 1, 1, 0.1, 1, 10],
+    'two rotations': [0, 0, 0, 1, 1, 0],
+    'a direction': [1, 1, 1, 1, 1, 0],
+}
+
+
+@pytest.mark.parametrize('frame', ['base', 'end'])
+@pytest.mark.parametrize('mask', MASKS.values(), ids=MASKS)
+@every_robot
+def test_parts_of_a_pose_are_reached(arm, mask, frame):
+    """From every start but few of which the search needs another one."""
+    rng = np.random.default_rng(8)
+    lower, upper = arm.limits
+    q, q0 = rng.uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (2, 50, arm.joints))
+    target = arm.forward_kinematics(q)
+    result = arm.inverse_kinematics(target, q0, frame, mask=mask)
+    assert result.converged.all()
+    assert np.mean(result.iterations) < 100
+    missing = spatial_displacement(arm.forward_kinematics(result.q), target)
+    if frame == 'base':
+        R = arm.forward_kinematics(result.q)[:, np.newaxis, :3, :3]
+        missing = (R @ missing.reshape(50, 2, 3, 1)).reshape(50, 6)
+    assert np.linalg.norm(np.sqrt(mask) * missing, axis=-1).max() < 1.1e-6
+
+
+def test_one_angle_is_reached_from_a_start_where_another_error_would_stop_the_search():
+    q = [3.135, -1.494, 2.193, 0.664, 1.923, 0.819]
+    q0 = [0.311, 2.422, 2.335, -2.311, -1.225, -0.579]
+    target = UR5.forward_kinematics(q)
+    assert UR5.inverse_kinematics(target, q0, mask=[0, 0, 0, 0, 0, 1], restarts=0).converged
+
+
+def test_a_drill_may_turn_about_its_own_axis():
+    rng = np.random.default_rng(3)
+    lower, upper = IIWA.limits
+    q, q0 = rng.uniform(lower, upper, (2, 7))
+    target = IIWA.forward_kinematics(q)
+    found = IIWA.inverse_kinematics(target, q0, 'end', mask=[1, 1, 1, 1, 1, 0])
+    reached = IIWA.forward_kinematics(found.q)
+    np.testing.assert_allclose(reached[:3, 2:], target[:3, 2:], rtol=0.0, atol=2e-6)
+    assert np.abs(reached[:3, :2] - target[:3, :2]).max() > 0.1
+    with pytest.raises(ValueError, match="frame must be one of 'base', 'end', got 'tool'"):
+        IIWA.inverse_kinematics(target, q0, 'tool')
+
+
 # --- Pose vectors
 
 
@@ -205,20 +254,12 @@ def test_the_difference_of_poses_is_the_displacement_in_the_axes_of_the_base():
     np.testing.assert_allclose(found[3], pose_vector_difference(*map(pose_vector, (T_desired[3], T[3]))))
 
 
-def test_the_jacobian_gives_the_gradient_of_the_error():
-    """Exactly, also far from the target: `d(e^T e)/2 = -e^T J dq`."""
-    q = configurations(PANDA)
-    target = pose_vector(PANDA.forward_kinematics(q + 0.8))
-
-    def half_square(q):
-        e = pose_vector_difference(target, pose_vector(PANDA.forward_kinematics(q)))
-        return 0.5 * np.einsum('ki,ki->k', e, e), e
-
-    _, e = half_square(q)
-    gradient = -np.einsum('kin,ki->kn', PANDA.jacobian(q), e)
-    for joint, by in enumerate(1e-5 * np.eye(7)):
-        slope = (half_square(q + by)[0] - half_square(q - by)[0]) / 2e-5
-        np.testing.assert_allclose(gradient[:, joint], slope, rtol=0.0, atol=1e-8)
+def test_the_displacement_of_pose_vectors_is_that_of_the_poses():
+    T, T_desired = (UR5.forward_kinematics(configurations(UR5) + by) for by in (0.0, 0.5))
+    found = pose_vector_displacement(pose_vector(T_desired), pose_vector(T))
+    np.testing.assert_allclose(found, spatial_displacement(T, T_desired), rtol=0.0, atol=1e-12)
+    one = pose_vector_displacement(pose_vector(T_desired[3]), pose_vector(T[3]))
+    np.testing.assert_allclose(one, found[3], rtol=0.0, atol=1e-14)
 
 
 # --- Arguments
@@ -239,13 +280,17 @@ def test_the_jacobian_gives_the_gradient_of_the_error():
             {'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'prismatic': (1,)},
             'prismatic must be an integer from 0 to 0',
         ),
-        ({'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': (1.0, -1.0)}, 'limits must have lower <= upper'),
         (
-            {'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': [[-1.0, 1.0]]},
-            'limits must be a lower and an upper',
+            {'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': (1.0, -1.0)},
+            'limits must be .* lower <= upper',
         ),
-        ({'a': [1.0, 1.0], 'alpha': 0.0, 'd': 0.0, 'limits': ([1.0], 2.0)}, r'of shape \(2,\), got'),
-        ({'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': 1.0}, 'limits must be a lower and an upper'),
+        (
+            {'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': (np.inf, np.inf)},
+            'limits must be .* got .*inf',
+        ),
+        ({'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': [[-1.0, 1.0]]}, 'limits must be a pair'),
+        ({'a': [1.0, 1.0], 'alpha': 0.0, 'd': 0.0, 'limits': ([1.0], 2.0)}, r'shape \(\) or \(2,\)'),
+        ({'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': 1.0}, 'limits must be a pair'),
         ({'a': [], 'alpha': [], 'd': []}, r'one shape \(n,\), with n >= 1'),
     ],
 )
@@ -260,7 +305,12 @@ def test_wrong_arguments_are_named():
         (lambda: UR5.jacobian(np.zeros(7)), r'q must have shape \(..., 6\)'),
         (lambda: UR5.forward_kinematics([np.inf] * 6), 'q must be finite'),
         (lambda: UR5.joint_torques(np.zeros(6), np.zeros(3)), r'wrench must have shape \(..., 6\)'),
-        (lambda: UR5.inverse_kinematics(np.ones((4, 4)), np.zeros(6)), 'T must be'),
+        (lambda: UR5.inverse_kinematics(np.ones((4, 4)), np.zeros(6)), 'target must be'),
+        (
+            lambda: UR5.inverse_kinematics(np.eye(3), np.zeros(6)),
+            r'target must have shape \(..., 4, 4\)',
+        ),
+        (lambda: UR5.inverse_kinematics(np.eye(4), np.zeros(5)), r'q0 must have shape \(..., 6\)'),
     ):
         with pytest.raises(ValueError, match=words):
             call()
