@@ -34,7 +34,10 @@ setup(
     author_email='maintainers@example.com',
     license='Apache-2.0',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={PACKAGE: ['py.typed', 'ros/fastdds/*.xml'], f'{PACKAGE}.live': ['page/*']},
+    package_data={
+        PACKAGE: ['py.typed', 'ros/fastdds/*.xml', 'lockstep/external/*.c'],
+        f'{PACKAGE}.live': ['page/*'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

@@ -553,6 +553,7 @@ class Lockstep:
         queue_depth: int = 10,
         timeout: float = 30.0,
         patience: float = 5.0,
+        wall_time: str = 'real',
     ) -> NodeProcess:
         """Start a process, whose nodes take part as if they had been added.
 
@@ -572,6 +573,8 @@ class Lockstep:
             timeout: Longest time until its nodes have been discovered (s).
             patience: Longest time for a callback (s). For both, time during which it waited for a
                 processor does not count.
+            wall_time: `simulated` lets clocks, sleeps and timers on wall time follow the world, too. It
+                needs a C compiler, once.
 
         Returns:
             The process.
@@ -592,6 +595,7 @@ class Lockstep:
             queue_depth=queue_depth,
             timeout=timeout,
             patience=patience,
+            wall_time=wall_time,
         )
         process = NodeProcess(
             parameters, self._nodes, self._scheduler, self._extend, lambda: self.is_open

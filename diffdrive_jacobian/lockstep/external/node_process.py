@@ -31,6 +31,7 @@ from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 
+from diffdrive_jacobian.lockstep._clock import MAX_SECONDS
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._gate import FREE
 from diffdrive_jacobian.lockstep._link import Link, Source, Stage
@@ -49,6 +50,7 @@ from diffdrive_jacobian.lockstep.external.quiet import (
     threads_of_this_process,
 )
 from diffdrive_jacobian.lockstep.external.relays import CALL, INPUT, SERVICE, TOPIC, Arrived, Relay
+from diffdrive_jacobian.lockstep.external.wall_time import WALL_TIMES, WallTime
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.names import node_of
 from diffdrive_jacobian.messages.topics import CLOCK
@@ -73,6 +75,8 @@ SILENCE = 0.2
 """Time for which a process that has started must not send anything by itself (s)."""
 SUBSCRIBING = 3.0
 """Least time until a node must be subscribed to /clock (s): its name may be discovered before."""
+STARTING = 0.3
+"""Time that nodes need at most to spin, unless they sleep or wait before (s)."""
 MATCHING = 5.0
 """Time after which a process is started again if endpoints that were discovered are not matched (s)."""
 LOOP = 2.0
@@ -87,6 +91,8 @@ END = 2.0
 """Time in which a process ends after a process of its nodes has (s)."""
 SYNCHRONOUS = {'RMW_FASTRTPS_PUBLICATION_MODE': 'SYNCHRONOUS'}
 """Environment of processes: a thread of Fast DDS would publish later what is published at once."""
+BEFORE = NANOSECONDS
+"""For how long before it takes part a process may have the time that it waits for to start (ns)."""
 ATTEMPTS = 2
 """Number of starts, if another program comes into the domain, or endpoints are not matched."""
 
@@ -111,6 +117,7 @@ class Command:
     queue_depth: int
     timeout: float
     patience: float
+    wall_time: str = WALL_TIMES[0]
 
     def __post_init__(self) -> None:
         """Check the command."""
@@ -129,16 +136,18 @@ class Command:
         depth = self.queue_depth
         if isinstance(depth, bool) or not isinstance(depth, int) or not 0 < depth < relays.DEPTH:
             raise _error(f'queue_depth must be an integer from 1 to {relays.DEPTH - 1}', depth)
+        if self.wall_time not in WALL_TIMES:
+            raise _error(f'wall_time must be {" or ".join(WALL_TIMES)}', self.wall_time)
         for name in ('clock_period', 'timeout', 'patience'):
             checked_nanoseconds(name, getattr(self, name))
 
-    def start(self, domain: Mapping[str, str], rules: Sequence[str]) -> ExternalProcess:
-        """Start the process, with environment variables for its ROS domain, and further arguments."""
+    def start(self, environment: Mapping[str, str], rules: Sequence[str]) -> ExternalProcess:
+        """Start the process, with environment variables for it, and further arguments."""
         timed = ('--ros-args', '-p', 'use_sim_time:=true') if self.use_sim_time else ()
         hash_seed = {} if 'PYTHONHASHSEED' in os.environ else {'PYTHONHASHSEED': '0'}
         return ExternalProcess(
             [*(os.fspath(part) for part in self.command), *timed],
-            {**domain, **for_other_process(), **hash_seed, **SYNCHRONOUS, **self.env},
+            {**environment, **for_other_process(), **hash_seed, **SYNCHRONOUS, **self.env},
             None if self.cwd is None else os.fspath(self.cwd),
             rules,
         )
@@ -239,9 +248,15 @@ class NodeProcess:
         self._called: dict[str, tuple[str, StandIn]] = {}
         self._services_changed = True
         self._given = -1
+        self._before = -BEFORE
         self._exchanges = 0
         self._listeners: list[int] = []
         self._listened: list[int] = []
+        self._wall_time: WallTime | None = None
+        self._wall_begin = 0
+        """Wall time when the world began (ns)."""
+        self._planned = 0
+        """World time at which wall time goes on for somebody (ns)."""
 
     # --- What the test sees
 
@@ -315,10 +330,15 @@ class NodeProcess:
         self._leave()
 
     def _wake(self) -> None:
-        """Send the time that the nodes have, for nothing but to wake them up."""
+        """Send the time that the nodes have, for nothing but to wake them up, so that they end."""
+        if self._wall_time is not None:
+            self._wall_time.end()
         if self._connected:
-            for publisher in self._clock_publishers.values():
-                raw_sender(publisher)(self._time_message(self._clocks.now))
+            self._send_time()
+
+    def _send_time(self, offset: int = 0) -> None:
+        for publisher in self._clock_publishers.values():
+            raw_sender(publisher)(self._time_message(max(1, self._clocks.now + offset)))
 
     def _forget(self) -> None:
         """Do not let a fault start it again."""
@@ -379,6 +399,10 @@ class NodeProcess:
         )
         self._closing.callback(self._outside.destroy_node)
         receiving = threads_of_this_process() - before
+        if self._command.wall_time == 'simulated':
+            self._wall_time = WallTime(self._clocks.now)
+            self._closing.callback(self._wall_time.close)
+            domain |= self._wall_time.environment()
         self.child = self._command.start(domain, graphs.rules_apart(sorted(self._apart)))
         self.child.wake = self._wake
         self._quiet = Quiet(self.child.root, receiving)
@@ -392,6 +416,10 @@ class NodeProcess:
         """Add the nodes to the world. They receive the time."""
         self._add_nodes()
         self._connected = True
+        if self._wall_time is not None:
+            self._wall_begin = self._wall_time.steady - self._scheduler.agenda.now
+            self._planned = 0
+            self._plan()
         (first, *_) = self._stand_ins.values()
         first.create_timer(self._command.clock_period, self._give_time)
         first.executor.create_task(self._begin)
@@ -460,6 +488,7 @@ class NodeProcess:
         allowance = Allowance(self._quiet, self._command.timeout)
         matched_by: Allowance | None = None
         subscribing: Allowance | None = None
+        begin = time.monotonic()
         while True:
             while not (self._learn() and self._is_matched()):
                 self.child.check_running()
@@ -469,6 +498,8 @@ class NodeProcess:
                     matched_by = matched_by or Allowance(self._quiet, matching)
                     if matched_by.is_used_up():
                         raise UnmatchedError(self._not_discovered())
+                elif time.monotonic() > begin + STARTING:
+                    self._sleep_on()
                 time.sleep(PERIOD)
             known = len(self._relays)
             self._confirm(allowance)
@@ -503,6 +534,8 @@ class NodeProcess:
         self._quiet.learn()
         for pid in self._participants:
             self._datagrams.watch(pid)
+        if self._wall_time is not None:
+            self._wall_time.check(self._participants)
         self._marks = graphs.marks(self._outside)
         self.child.note_shared_memory(self._participants)
         self._warn()
@@ -731,11 +764,25 @@ class NodeProcess:
                 # The node may wait for a service of the world before it spins.
                 self._learn()
             overdue = response is None and time.monotonic() > begin + number * REPETITION
+            if number and response is None and time.monotonic() > begin + STARTING:
+                self._sleep_on()
             if overdue and client.service_is_ready():
                 number = send_request(client, GetParameters.Request(names=['use_sim_time']))
+                self._wait()
+                if number > 1 and not self._quiet.spins():
+                    # A loop may wait for the time, as by a Rate on the clock of the node.
+                    self._before = min(self._before + BEFORE // 20, 0)
+                    self._send_time(self._before)
             time.sleep(PERIOD / 10)
             response = take_response(client) or response
         self._outside.destroy_client(client)
+
+    def _sleep_on(self) -> None:
+        """Let a process that sleeps before its nodes spin go on, in simulated wall time."""
+        if self._wall_time is None or not self._quiet.is_quiet() or self._quiet.spins():
+            return
+        if self._wall_time.sleep_on():
+            self._wait()
 
     def _untimed(self) -> list[str]:
         """Return the nodes that should receive the time and do not, as far as is discovered."""
@@ -797,15 +844,33 @@ class NodeProcess:
 
     def _give_time(self) -> object:
         """Give the process the time, unless it has it. Return FREE if it has sent nothing."""
-        now = self._clocks.now
-        if now == self._given:
-            return FREE
-        self._given = now
-        data = self._time_message(now)
-        # One after the other, so that the nodes of a process do not act at the same time.
-        senders = [raw_sender(publisher) for publisher in self._clock_publishers.values()]
-        sent = [self._exchange(partial(send, data)) for send in senders]
-        return None if any(sent) else FREE
+        now, wall = self._clocks.now, self._wall_begin + self._scheduler.agenda.now
+        sent = 0
+        if self._wall_time is not None:
+            self._wall_time.give(wall, now)
+        if now != self._given:
+            self._given = now
+            data = self._time_message(now)
+            # One after the other, so that the nodes of a process do not act at the same time.
+            for publisher in self._clock_publishers.values():
+                sent += self._exchange(partial(raw_sender(publisher), data))
+        while self._wall_time is not None and (first := self._wall_time.next()) and first[0] <= wall:
+            sent += self._exchange(partial(self._wall_time.let_go_on, first[1]))
+        return None if sent else FREE
+
+    def _plan(self) -> None:
+        """Let the process go on when the time has come for which it waits."""
+        if self._wall_time is None or (first := self._wall_time.next()) is None:
+            return
+        agenda, at = self._scheduler.agenda, first[0] - self._wall_begin
+        if at != self._planned and agenda.now < at < MAX_SECONDS * NANOSECONDS:
+            self._planned = at
+            agenda.at(at, self._go_on)
+
+    def _go_on(self) -> None:
+        if self._connected and self._planned == self._scheduler.agenda.now:
+            (first, *_) = self._stand_ins.values()
+            first.executor.create_task(self._give_time)
 
     @staticmethod
     def _time_message(now: int) -> bytes:
@@ -856,6 +921,7 @@ class NodeProcess:
             self._on_end()
         elif self._may_have_changed() and graph_changed(self._outside):
             self._learn_more()
+        self._plan()
         return len(arrived)
 
     def _may_have_changed(self) -> bool:

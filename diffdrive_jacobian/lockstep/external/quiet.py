@@ -396,6 +396,14 @@ class Quiet:
         # One of them waits for DDS, and one of rclcpp's threads, which is none of them, for signals.
         return max(found, 1)
 
+    def spins(self) -> bool:
+        """Return whether the main thread of a process waits in DDS, as an executor does."""
+        for thread in self._threads.values():
+            call = thread.read('syscall').encode().split() if thread.tid == thread.pid else []
+            if len(call) > 2 and self._addresses(thread, call[1:]):
+                return True
+        return False
+
     # --- Which threads there are
 
     def processes(self) -> list[int]:

@@ -1,0 +1,112 @@
+"""Unchanged processes whose timers, threads and loops live by wall time, in simulated wall time."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rclpy.node import Node
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian.exploration.trial import MessageDigest
+from diffdrive_jacobian.lockstep.external import wall_time
+from diffdrive_jacobian.testing import Lockstep, LockstepError
+
+NODES = Path(__file__).with_name('wall_time_nodes.py')
+PERIODS = {
+    **dict.fromkeys(('steady', 'system', 'sleep', 'event', 'condition', 'select', 'poll'), 20.0),
+    **dict.fromkeys(('posted', 'late', 'waiting', 'once'), 20.0),
+    # Python computes again for how long is left, and asyncio waits a millisecond longer.
+    'queue': 20.001,
+    'asyncio': 21.0,
+}
+"""When each kind of node publishes (ms)."""
+compiled = pytest.mark.skipif(
+    not any(map(shutil.which, wall_time.COMPILERS)),
+    reason='simulated wall time needs a C compiler',
+)
+
+
+class Heard(Node):
+    """Hears what a node says, and when (ms), and offers a service."""
+
+    def __init__(self, world):
+        super().__init__('listener')
+        self.all = []
+
+        def hear(message):
+            self.all.append((round(1000.0 * world.elapsed, 6), message.data))
+
+        self.create_subscription(String, 'tick', hear, 10)
+        self.create_service(Trigger, 'offered', lambda _, response: response)
+
+
+def run(kind, seconds=0.3, **options):
+    """Run a node. Return what it said and when, and the digest of all messages."""
+    with Lockstep() as world, MessageDigest(world) as digest:
+        world.add(heard := Heard(world))
+        process = world.start([sys.executable, str(NODES), kind], wall_time='simulated', **options)
+        world.run_for(seconds)
+        value = digest.value()
+        assert process.stop() == 0
+        return heard.all, value
+
+
+@compiled
+@pytest.mark.parametrize(('kind', 'period'), PERIODS.items(), ids=PERIODS)
+def test_what_waits_on_wall_time_goes_on_in_simulated_time(kind, period):
+    """To the millisecond, as its own clock sees it, too, and the same in each run."""
+    (heard, digest), (again, digest_again) = run(kind), run(kind)
+    assert heard == again
+    assert digest == digest_again
+    times, said = zip(*heard, strict=True)
+    assert times == pytest.approx([period * number for number in range(1, 1 + int(300.0 / period))])
+    spans = np.diff([float(text) for text in said])
+    assert spans == pytest.approx(np.full(len(spans), period / 1000.0), abs=1.1e-3)
+
+
+@compiled
+def test_who_is_due_at_once_goes_on_in_the_order_of_its_threads():
+    heard, _ = run('two')
+    assert heard == [(20.0 * number, 'timer thread') for number in range(1, 16)]
+
+
+@compiled
+def test_a_node_without_use_sim_time_follows_simulated_time_too():
+    heard, _ = run('system', use_sim_time=False)
+    assert [time for time, _ in heard] == [20.0 * number for number in range(1, 16)]
+
+
+@compiled
+def test_what_cannot_follow_is_named():
+    with pytest.raises(
+        LockstepError, match=r"calls setitimer, which wall_time='simulated' does not cover"
+    ):
+        run('alarm')
+
+
+@compiled
+def test_nothing_is_left_open():
+    run('sleep')
+    before = len(os.listdir('/proc/self/fd'))
+    run('sleep')
+    assert len(os.listdir('/proc/self/fd')) == before
+
+
+def test_without_a_compiler_the_error_says_what_it_would_allow(monkeypatch, tmp_path):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    monkeypatch.setenv('PATH', str(tmp_path))
+    with pytest.raises(
+        LockstepError, match='needs a C compiler once, cc, gcc or clang, and there is none'
+    ):
+        wall_time.built()
+
+
+def test_a_wall_time_that_does_not_exist_is_named():
+    with Lockstep() as world, pytest.raises(LockstepError, match="must be real or simulated, got 'sim'"):
+        world.start(['true'], wall_time='sim')
