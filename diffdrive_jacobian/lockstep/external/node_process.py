@@ -93,6 +93,8 @@ SYNCHRONOUS = {'RMW_FASTRTPS_PUBLICATION_MODE': 'SYNCHRONOUS'}
 """Environment of processes: a thread of Fast DDS would publish later what is published at once."""
 BEFORE = NANOSECONDS
 """For how long before it takes part a process may have the time that it waits for to start (ns)."""
+STUCK = 2 * NANOSECONDS
+"""World time after which a callback that waits without a timeout is an error (ns)."""
 ATTEMPTS = 2
 """Number of starts, if another program comes into the domain, or endpoints are not matched."""
 
@@ -255,6 +257,10 @@ class NodeProcess:
         self._wall_time: WallTime | None = None
         self._wall_begin = 0
         """Wall time when the world began (ns)."""
+        self._stuck: int | None = None
+        """World time since which a callback has not returned (ns)."""
+        self._cpp_threads = 0
+        """Largest number of threads of the executors of a process in C++."""
         self._planned = 0
         """World time at which wall time goes on for somebody (ns)."""
 
@@ -543,6 +549,7 @@ class NodeProcess:
     def _warn(self) -> None:
         """Warn of what may differ from run to run without an error."""
         threads = max(map(self._quiet.cpp_executor_threads, self._participants), default=0)
+        self._cpp_threads = threads
         why = ''
         if threads > 1:
             why = 'an executor with several threads may execute callbacks at the same time'
@@ -553,6 +560,8 @@ class NodeProcess:
                 'a thread waits for files with a timeout, as an event loop of asyncio, and what it does '
                 'by itself is not waited for'
             )
+        if threads and self._quiet.timed_executors and self._wall_time is None and not self._connected:
+            self._warn_of('its executor waits with a timeout, as with a timer of create_wall_timer')
         if why and not self._connected:
             warnings.warn(f'{self.child.title}: {why}; check_repeats shows it', stacklevel=6)
 
@@ -856,7 +865,33 @@ class NodeProcess:
                 sent += self._exchange(partial(raw_sender(publisher), data))
         while self._wall_time is not None and (first := self._wall_time.next()) and first[0] <= wall:
             sent += self._exchange(partial(self._wall_time.let_go_on, first[1]))
+        self._check_callbacks()
         return None if sent else FREE
+
+    def _check_callbacks(self) -> None:
+        """Check that callbacks return, unless they wait for a response or, by a timeout, for time."""
+        waits = self._wall_time is not None and self._wall_time.next(executors=False) is not None
+        now = self._scheduler.agenda.now
+        if not self._connected or waits or self._unanswered or not self._quiet.stuck():
+            self._stuck = None
+        elif self._stuck is None:
+            self._stuck = now
+        elif now - self._stuck >= STUCK:
+            raise LockstepError(
+                f'a callback of {", ".join(self._stand_ins)} has not returned since '
+                f'{self._stuck / NANOSECONDS:g} s: it waits, without a timeout, for something else than '
+                'a message of the world, as for a mutex that is locked twice\n' + self.describe()
+            )
+        if self._cpp_threads and self._quiet.new_thread_waits and self._wall_time is None:
+            self._cpp_threads = 0
+            self._warn_of('a thread that it has started meanwhile waits with a timeout, as by a Rate')
+
+    def _warn_of(self, what: str) -> None:
+        warnings.warn(
+            f'{self.child.title}: {what}: that is wall time, so what it does differs from run to run; '
+            "start(..., wall_time='simulated')",
+            stacklevel=6,
+        )
 
     def _plan(self) -> None:
         """Let the process go on when the time has come for which it waits."""

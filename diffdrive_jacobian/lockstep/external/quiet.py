@@ -179,6 +179,12 @@ class Quiet:
         """How often such a thread had run when it was first seen at this place."""
         self._depths: dict[int, int] = {}
         """Address of the top of the stack of each thread in an idle process."""
+        self._spinning: set[_Thread] = set()
+        """Main threads that wait in DDS in an idle process."""
+        self.timed_executors = 0
+        """How many threads do so with a timeout, as if they have a timer on wall time."""
+        self.new_thread_waits = False
+        """Whether a thread that an idle process did not have has waited with a timeout."""
 
     def has_ended(self, pid: int) -> bool:
         """Return whether a process of those that are observed had ended when it was looked at last."""
@@ -338,10 +344,14 @@ class Quiet:
         """Note which threads wait with a timeout, and how: the process is idle, and was found quiet."""
         timed, calls = [], {}
         self.loops = True
+        self._spinning = set()
         for thread in self._threads.values():
             number, *arguments = thread.idle.split() or [b'']
             if arguments:
                 self._depths[thread.tid] = int(arguments[-2], 16)
+                main = thread.tid == thread.pid
+                if main and number in FUTEX and self._addresses(thread, arguments):
+                    self._spinning.add(thread)
             place = self._waits.get(number, NEVER)
             if place != NEVER and arguments[place] not in ENDLESS:
                 timed.append((thread, self._addresses(thread, arguments)))
@@ -357,6 +367,7 @@ class Quiet:
                 loops[key] = min(times, self._loops.get(key, times))
                 self.loops = self.loops and times > loops[key]
         self._loops = loops
+        self.timed_executors = len(loops)
         polling = {thread for thread, found in timed if self._places.isdisjoint(found)}
         self._polling = {thread.tid for thread in polling}
         self.polls_files = any(number not in FUTEX for number in map(calls.get, polling))
@@ -367,7 +378,9 @@ class Quiet:
             return False
         if thread.tid not in self._depths:
             # A new thread, as an executor starts them for callbacks, and DDS for a new participant.
-            return not thread.read('comm').startswith('dds.')
+            new = not thread.read('comm').startswith('dds.')
+            self.new_thread_waits |= new
+            return new
         if int(arguments[-2], 16) < self._depths[thread.tid] - DEEPER:
             return True
         if thread.tid in self._polling:
@@ -403,6 +416,13 @@ class Quiet:
             if len(call) > 2 and self._addresses(thread, call[1:]):
                 return True
         return False
+
+    def stuck(self) -> bool:
+        """Return whether the main thread of a quiet process has not returned from a callback."""
+        places = [(self._depths[thread.tid], thread.idle.split()) for thread in self._spinning]
+        return bool(places) and all(
+            len(call) > 2 and int(call[-2], 16) < depth - DEEPER for depth, call in places
+        )
 
     # --- Which threads there are
 
