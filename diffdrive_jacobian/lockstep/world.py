@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, ClassVar, TypeVar
 
@@ -554,6 +554,7 @@ class Lockstep:
         timeout: float = 30.0,
         patience: float = 5.0,
         wall_time: str = 'real',
+        without: Collection[str] = (),
     ) -> NodeProcess:
         """Start a process, whose nodes take part as if they had been added.
 
@@ -575,6 +576,7 @@ class Lockstep:
                 processor does not count.
             wall_time: `simulated` lets clocks, sleeps and timers on wall time follow the world, too. It
                 needs a C compiler, once.
+            without: Topics that stay in the process, such as `/diagnostics`.
 
         Returns:
             The process.
@@ -596,6 +598,7 @@ class Lockstep:
             timeout=timeout,
             patience=patience,
             wall_time=wall_time,
+            without=without,
         )
         process = NodeProcess(
             parameters, self._nodes, self._scheduler, self._extend, lambda: self.is_open

@@ -278,6 +278,17 @@ def test_the_clock_jumps_and_stands_still_for_processes_too(lockstep):
     assert len([tick for tick in ticks if tick > 4.9]) == pytest.approx(7, abs=1)
 
 
+def test_a_topic_may_stay_in_the_process(lockstep):
+    answers = lockstep.listen(Header, 'echo/out')
+    process = lockstep.start(command('echo'), without=['/echo/out'])
+    (node,) = process.nodes
+    lockstep.publish('echo/in', Float64(data=1.0))
+    lockstep.run_for(0.1)
+    assert answers == []
+    assert '/echo/in' in {one.topic_name for one in node.subscriptions}
+    assert '/echo/out' not in {one.topic_name for one in node.publishers}
+
+
 # --- Faults and properties
 
 

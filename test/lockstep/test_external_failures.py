@@ -296,7 +296,7 @@ def test_several_nodes_in_cpp_are_warned_of(lockstep, monkeypatch, recwarn):
     )
     with pytest.warns(UserWarning, match='rclcpp calls timers of one of several nodes') as warned:
         lockstep.start(command('ticker', 'bare'))
-    assert warned[0].filename == __file__
+    assert {one.filename for one in warned} == {__file__}
 
 
 def test_random_addresses_are_refused(lockstep, monkeypatch):
@@ -347,9 +347,13 @@ def test_start_takes_a_program_and_its_arguments(lockstep):
         *(('env', env) for env in (3, {'A': 1}, {'A=B': 'x'}, {'': 'x'}, {'A': '\0'}, {1: 'x'})),
         *(('queue_depth', depth) for depth in (0, -3, 2.5, True, '10', 1000)),
         *(('cwd', cwd) for cwd in (3, 'a\0b')),
+        *(('wall_time', wall_time) for wall_time in ('sim', None, True)),
+        *(('without', without) for without in ('/out', ['out'], [3])),
     ]:
         with fails(rf'{name} must be .*, got '):
             lockstep.start(['true'], **{name: wrong})
+    with fails(r'has no topic /out, /silent \(without=\)'):
+        lockstep.start(command('echo'), without=['/silent', '/out', '/echo/out'])
     for cwd in ('/no/such/folder', __file__):
         with fails(r'cannot be started: .*(No such|Not a)'):
             lockstep.start(['true'], cwd=cwd)

@@ -14,7 +14,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.exploration.trial import MessageDigest
-from diffdrive_jacobian.lockstep.external import wall_time
+from diffdrive_jacobian.lockstep.external import quiet, wall_time
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
 NODES = Path(__file__).with_name('wall_time_nodes.py')
@@ -108,6 +108,28 @@ def test_nothing_is_left_open():
     assert len(os.listdir('/proc/self/fd')) <= before
 
 
+def test_a_callback_that_never_returns_is_named():
+    """A mutex that is locked twice: by the second message."""
+    with Lockstep() as world:
+        world.start([sys.executable, str(NODES), 'deadlock'])
+        for _ in range(2):
+            world.publish('poke', String())
+            world.run_for(0.5)
+        world.run_for(1.4)
+        with pytest.raises(LockstepError, match=r'callback of /ticker has not returned since 0\.5\d* s'):
+            world.run_for(0.2)
+
+
+def test_a_thread_in_cpp_that_waits_on_wall_time_is_warned_of(monkeypatch):
+    """As if it were in C++: a library that the process has."""
+    monkeypatch.setattr(quiet, 'RCLCPP', '_rclpy_pybind11')
+    with Lockstep() as world:
+        world.start([sys.executable, str(NODES), 'later'])
+        world.publish('poke', String())
+        with pytest.warns(UserWarning, match='a thread that it has started meanwhile waits with'):
+            world.run_for(0.1)
+
+
 def test_without_a_compiler_the_error_says_what_it_would_allow(monkeypatch, tmp_path):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     monkeypatch.setenv('PATH', str(tmp_path))
@@ -115,8 +137,3 @@ def test_without_a_compiler_the_error_says_what_it_would_allow(monkeypatch, tmp_
         LockstepError, match='needs a C compiler once, cc, gcc or clang, and there is none'
     ):
         wall_time.built()
-
-
-def test_a_wall_time_that_does_not_exist_is_named():
-    with Lockstep() as world, pytest.raises(LockstepError, match="must be real or simulated, got 'sim'"):
-        world.start(['true'], wall_time='sim')

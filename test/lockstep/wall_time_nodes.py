@@ -109,6 +109,15 @@ def main():
                 both()
 
         threading.Thread(target=loop, daemon=True).start()
+    elif kind == 'deadlock':
+        mutex = threading.Lock()
+        node.create_subscription(String, 'poke', lambda _: mutex.acquire(), 10)
+    elif kind == 'later':
+
+        def begin_to_wait(_):
+            threading.Thread(target=lambda: threading.Event().wait(0.05)).start()
+
+        node.create_subscription(String, 'poke', begin_to_wait, 10)
     elif kind == 'alarm':
         signal.signal(signal.SIGALRM, lambda *_: None)
         signal.setitimer(signal.ITIMER_REAL, PERIOD, PERIOD)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from rclpy.duration import Duration
@@ -103,8 +103,8 @@ def rules_apart(topics: Iterable[str]) -> list[str]:
     return ['--ros-args', *(word for topic in topics for word in ('-r', f'{topic}:=~/{APART}{topic}'))]
 
 
-def nodes_beside(node: Node) -> list[NodeGraph]:
-    """Return the other nodes in the domain of a node, by their names."""
+def nodes_beside(node: Node, without: Collection[str] = ()) -> list[NodeGraph]:
+    """Return the other nodes in the domain of a node, by their names, without some topics."""
     own = node.get_name(), node.get_namespace()
     found = []
     for name, namespace in sorted(node.get_node_names_and_namespaces()):
@@ -126,7 +126,11 @@ def nodes_beside(node: Node) -> list[NodeGraph]:
         for services in parts[2:]:
             for service in [one for one, kind in services.items() if kind.startswith(DESCRIPTIONS)]:
                 del services[service]
-        found.append(NodeGraph(name, namespace, *parts))
+        graph = NodeGraph(name, namespace, *parts)
+        for topics in parts[:2]:
+            for topic in [one for one in topics if graph.name_in_world(one) in without]:
+                del topics[topic]
+        found.append(graph)
     return found
 
 

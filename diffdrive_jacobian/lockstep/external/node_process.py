@@ -15,7 +15,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -120,6 +120,7 @@ class Command:
     timeout: float
     patience: float
     wall_time: str = WALL_TIMES[0]
+    without: Collection[str] = ()
 
     def __post_init__(self) -> None:
         """Check the command."""
@@ -138,6 +139,8 @@ class Command:
         depth = self.queue_depth
         if isinstance(depth, bool) or not isinstance(depth, int) or not 0 < depth < relays.DEPTH:
             raise _error(f'queue_depth must be an integer from 1 to {relays.DEPTH - 1}', depth)
+        if isinstance(self.without, str) or not all(str(one).startswith('/') for one in self.without):
+            raise _error("without must be names of topics, ['/diagnostics']", self.without)
         if self.wall_time not in WALL_TIMES:
             raise _error(f'wall_time must be {" or ".join(WALL_TIMES)}', self.wall_time)
         for name in ('clock_period', 'timeout', 'patience'):
@@ -544,6 +547,9 @@ class NodeProcess:
             self._wall_time.check(self._participants)
         self._marks = graphs.marks(self._outside)
         self.child.note_shared_memory(self._participants)
+        there = {topic for topic, _ in self._outside.get_topic_names_and_types()}
+        if not self._connected and (unknown := sorted(set(self._command.without) - there)):
+            raise LockstepError(f'{self.child.title} has no topic {", ".join(unknown)} (without=)')
         self._warn()
 
     def _warn(self) -> None:
@@ -561,7 +567,7 @@ class NodeProcess:
                 'by itself is not waited for'
             )
         if threads and self._quiet.timed_executors and self._wall_time is None and not self._connected:
-            self._warn_of('its executor waits with a timeout, as with a timer of create_wall_timer')
+            self._warn_of('its executor waits with a timeout, as with a timer of create_wall_timer', 7)
         if why and not self._connected:
             warnings.warn(f'{self.child.title}: {why}; check_repeats shows it', stacklevel=6)
 
@@ -573,7 +579,7 @@ class NodeProcess:
         Raises:
             LockstepError: They share one although they were given topics of their own.
         """
-        found = graphs.nodes_beside(self._outside)
+        found = graphs.nodes_beside(self._outside, self._command.without)
         shared = graphs.shared_topics(found)
         if not shared:
             return False
@@ -581,7 +587,8 @@ class NodeProcess:
             raise LockstepError(
                 f'several nodes of {self.child.title} share {", ".join(shared)}, which cannot be '
                 'separated: the command remaps it itself, or it was created after the start; which of '
-                'them receives a message first would differ: start each node by itself'
+                'them receives a message first would differ: start each node by itself, and load each '
+                'component into a container of its own'
             )
         self._apart |= {graph.name_in_world(topic) for graph in found for topic in graph.topics}
         return True
@@ -610,7 +617,7 @@ class NodeProcess:
 
     def _learn(self) -> bool:
         """Create what the topics and services of the process need. Return whether it has nodes."""
-        found = graphs.nodes_beside(self._outside)
+        found = graphs.nodes_beside(self._outside, self._command.without)
         if len({graph.full_name for graph in found}) < len(found):
             names = [graph.full_name for graph in found]
             raise LockstepError(
@@ -823,7 +830,7 @@ class NodeProcess:
 
     def _gone(self) -> list[str]:
         """Return the nodes that were destroyed, or created anew, since this was last asked."""
-        there = {graph.full_name for graph in graphs.nodes_beside(self._outside)}
+        there = {graph.full_name for graph in graphs.nodes_beside(self._outside, self._command.without)}
         marks = graphs.marks(self._outside)
         anew = {name for name, mark in marks.items() if self._marks.get(name, mark) != mark}
         self._marks = {**self._marks, **marks}
@@ -886,11 +893,11 @@ class NodeProcess:
             self._cpp_threads = 0
             self._warn_of('a thread that it has started meanwhile waits with a timeout, as by a Rate')
 
-    def _warn_of(self, what: str) -> None:
+    def _warn_of(self, what: str, stacklevel: int = 6) -> None:
         warnings.warn(
             f'{self.child.title}: {what}: that is wall time, so what it does differs from run to run; '
             "start(..., wall_time='simulated')",
-            stacklevel=6,
+            stacklevel=stacklevel,
         )
 
     def _plan(self) -> None:

@@ -419,10 +419,14 @@ class Quiet:
 
     def stuck(self) -> bool:
         """Return whether the main thread of a quiet process has not returned from a callback."""
-        places = [(self._depths[thread.tid], thread.idle.split()) for thread in self._spinning]
-        return bool(places) and all(
-            len(call) > 2 and int(call[-2], 16) < depth - DEEPER for depth, call in places
-        )
+        return bool(self._spinning) and all(map(self._is_elsewhere, self._spinning))
+
+    def _is_elsewhere(self, thread: _Thread) -> bool:
+        """Return whether a thread waits, but not in DDS as in an idle process."""
+        call = thread.idle.split()
+        if len(call) < 3 or int(call[-2], 16) == self._depths[thread.tid]:
+            return False
+        return not self._addresses(thread, call[1:])
 
     # --- Which threads there are
 
