@@ -159,8 +159,9 @@ def built() -> Path:
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         made = Path(folder, library.name)
         command = [compiler, '-shared', '-fPIC', '-O2', '-pthread', '-o', str(made), str(SOURCE), '-ldl']
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise LockstepError(f'{" ".join(command)} fails:\n{done.stderr}')
+        try:
+            subprocess.check_output(command, stderr=subprocess.STDOUT, text=True)
+        except subprocess.CalledProcessError as error:
+            raise LockstepError(f'{" ".join(command)} fails:\n{error.output}') from error
         made.replace(library)
     return library
