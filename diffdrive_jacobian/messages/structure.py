@@ -163,7 +163,10 @@ def _of_class(name: str, text: str) -> FieldType:
     if found:
         return Sequence(_of_class(name, found['sequence']), _number(found['most']))
     if found := _CLASS.fullmatch(text):
-        # Fields of messages are messages; those of services and actions too.
+        # Fields are messages, or parts of an action, such as Fibonacci_Feedback.
+        action, _, part = found[2].partition('_')
+        if part:
+            return structure(getattr(import_type(f'{found[1]}/action/{action}'), part))
         return structure(import_type(f'{found[1]}/msg/{found[2]}'))
     raise TypeError(f'field {name} must have a type of ROS 2, got {text}')
 

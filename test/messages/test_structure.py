@@ -8,6 +8,7 @@ import pkgutil
 from contextlib import suppress
 
 import geometry_msgs.msg
+import pytest
 import rcl_interfaces.msg
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Goals, Odometry
@@ -72,3 +73,10 @@ def test_integers_have_limits():
         'step': (0, 2**64 - 1),
     }
     assert Number('?').limits is Number('d').limits is None
+
+
+def test_parts_of_an_action_are_found():
+    actions = pytest.importorskip('test_msgs.action', reason='test_msgs is not installed')
+    feedback = structure(actions.Fibonacci.Impl.FeedbackMessage)
+    assert [name for name, _ in feedback.fields] == ['goal_id', 'feedback']
+    assert feedback.fields[1][1] == structure(actions.Fibonacci.Feedback)
