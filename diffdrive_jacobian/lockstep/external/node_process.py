@@ -93,6 +93,8 @@ SYNCHRONOUS = {'RMW_FASTRTPS_PUBLICATION_MODE': 'SYNCHRONOUS'}
 """Environment of processes: a thread of Fast DDS would publish later what is published at once."""
 BEFORE = NANOSECONDS
 """For how long before it takes part a process may have the time that it waits for to start (ns)."""
+WAKES = 20
+"""How often a process that is to end is woken up before real time goes on in it."""
 STUCK = 2 * NANOSECONDS
 """World time after which a callback that waits without a timeout is an error (ns)."""
 ATTEMPTS = 2
@@ -258,6 +260,7 @@ class NodeProcess:
         self._listeners: list[int] = []
         self._listened: list[int] = []
         self._wall_time: WallTime | None = None
+        self._wakes = 0
         self._wall_begin = 0
         """Wall time when the world began (ns)."""
         self._stuck: int | None = None
@@ -340,7 +343,9 @@ class NodeProcess:
 
     def _wake(self) -> None:
         """Send the time that the nodes have, for nothing but to wake them up, so that they end."""
-        if self._wall_time is not None:
+        self._wakes += 1
+        # First it notices the signal, and then who sleeps looks whether to go on.
+        if self._wall_time is not None and self._wakes > WAKES:
             self._wall_time.end()
         if self._connected:
             self._send_time()

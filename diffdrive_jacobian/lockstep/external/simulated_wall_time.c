@@ -171,7 +171,15 @@ static struct slot *enter_as(int64_t until, int executor) {
   return &none;
 }
 static struct slot *enter(int64_t until) { return enter_as(until, 0); }
-static void leave(struct slot *slot) { slot->state = FREE; }
+static void leave(struct slot *slot) {
+  long index = slot - page->slots;
+  if (index >= 0 && index < SLOTS) {
+    /* Another process may have the slot next. */
+    ends[index].file = 0;
+    ends[index].guard = NULL;
+  }
+  slot->state = FREE;
+}
 static int is_due(struct slot *slot) { return slot->state == DUE || ended(); }
 
 static void *watch(void *nothing) {
