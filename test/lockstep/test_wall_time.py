@@ -17,6 +17,7 @@ from diffdrive_jacobian.exploration.trial import MessageDigest
 from diffdrive_jacobian.lockstep.external import quiet, wall_time
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
+pytestmark = pytest.mark.process
 NODES = Path(__file__).with_name('wall_time_nodes.py')
 PERIODS = {
     **dict.fromkeys(('steady', 'system', 'sleep', 'event', 'condition', 'select', 'poll'), 20.0),
