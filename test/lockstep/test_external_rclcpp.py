@@ -8,10 +8,13 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
 from rclpy.parameter import Parameter
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.exploration.trial import MessageDigest
@@ -22,15 +25,21 @@ SOURCE = Path(__file__).with_name('rclcpp_controller')
 
 
 @pytest.fixture(scope='module')
-def controller(tmp_path_factory):
-    """Build the controller, and return its command."""
+def built(tmp_path_factory):
+    """Build the nodes, and return their folder."""
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     if shutil.which('cmake') is None or not any(Path(one, 'share/rclcpp').is_dir() for one in prefixes):
         pytest.skip('rclcpp or CMake is not installed: C++ nodes are not tested')
     folder = tmp_path_factory.mktemp('rclcpp')
     for command in (['cmake', '-S', str(SOURCE), '-B', '.'], ['cmake', '--build', '.']):
         subprocess.run(command, cwd=folder, check=True)
-    return [str(folder / 'controller')]
+    return folder
+
+
+@pytest.fixture
+def controller(built):
+    """Return the command of the controller."""
+    return [str(built / 'controller')]
 
 
 def drive(command):
@@ -56,3 +65,22 @@ def drive(command):
 
 def test_a_node_in_cpp_does_the_same_each_time(controller):
     assert drive(controller) == drive(controller)
+
+
+@pytest.mark.parametrize(
+    'how', ['timer', 'rate', 'sleep', 'sleep_until', 'condition', 'system', 'future']
+)
+def test_what_waits_on_wall_time_in_cpp_goes_on_in_simulated_time(built, how):
+    """As in `test_wall_time.py`."""
+    heard = []
+    with Lockstep() as world:
+        listener = Node('listener')
+        listener.create_subscription(
+            String, 'tick', lambda tick: heard.append((round(1000.0 * world.elapsed), tick.data)), 10
+        )
+        world.add(listener)
+        process = world.start([str(built / 'ticker'), how], wall_time='simulated')
+        world.run_for(0.2)
+        assert process.stop() == 0
+    assert [time for time, _ in heard] == list(range(20, 201, 20))
+    assert np.diff([float(said) for _, said in heard]) == pytest.approx(np.full(9, 0.02), abs=1e-9)

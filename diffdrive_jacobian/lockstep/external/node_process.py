@@ -559,7 +559,9 @@ class NodeProcess:
 
     def _warn(self) -> None:
         """Warn of what may differ from run to run without an error."""
-        threads = max(map(self._quiet.cpp_executor_threads, self._participants), default=0)
+        asleep = self._wall_time.sleeping() if self._wall_time is not None else ()
+        pids = self._participants
+        threads = max((self._quiet.cpp_executor_threads(pid, asleep) for pid in pids), default=0)
         self._cpp_threads = threads
         why = ''
         if threads > 1:

@@ -20,7 +20,7 @@ import platform
 import sys
 import time
 from array import array
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -395,8 +395,11 @@ class Quiet:
         words = _stack(thread, arguments)
         return {place for place, word in enumerate(words) for code in self._dds[pid] if word in code}
 
-    def cpp_executor_threads(self, pid: int) -> int:
-        """Return how many threads of executors an idle process in C++ has. 0: it is not in C++."""
+    def cpp_executor_threads(self, pid: int, sleeping: Collection[int] = ()) -> int:
+        """Return how many threads of executors an idle process in C++ has. 0: it is not in C++.
+
+        Threads that are known to be sleeping are none.
+        """
         threads = [thread for thread in self._threads.values() if thread.pid == pid]
         code = _code(threads[0], RCLCPP) if threads else []
         if not code:
@@ -404,7 +407,7 @@ class Quiet:
         found = 0
         for thread in threads:
             call = thread.read('syscall').encode().split()
-            if len(call) > 2 and not self._addresses(thread, call[1:]):
+            if len(call) > 2 and thread.tid not in sleeping and not self._addresses(thread, call[1:]):
                 found += any(word in part for word in _stack(thread, call) for part in code)
         # One of them waits for DDS, and one of rclcpp's threads, which is none of them, for signals.
         return max(found, 1)

@@ -95,6 +95,10 @@ class WallTime:
         first = min(waiting, key=lambda slot: (until[slot], abs(thread[slot])))
         return int(until[first]), int(first)
 
+    def sleeping(self) -> set[int]:
+        """Return the threads that wait for a time, without executors."""
+        return {int(one) for one in self._slots['thread'][self._slots['state'] == WAITS] if one > 0}
+
     def sleep_on(self) -> bool:
         """Advance to where the first that sleeps goes on, while the process starts. False: none does."""
         if (first := self.next(executors=False)) is None:
