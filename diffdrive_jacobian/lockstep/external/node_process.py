@@ -822,10 +822,17 @@ class NodeProcess:
         Raises:
             LockstepError: They are not, or do not follow simulated time any more.
         """
-        end = time.monotonic() + DESTRUCTION
+        end, before = time.monotonic() + DESTRUCTION, set(self._marks)
         while not (gone := self._gone()) and (untimed := self._untimed()):
             if time.monotonic() > end:
-                raise LockstepError(f'{", ".join(untimed)} has stopped to follow simulated time')
+                names = ', '.join(untimed)
+                if before.issuperset(untimed):
+                    raise LockstepError(f'{names} has stopped to follow simulated time')
+                raise LockstepError(
+                    f'{names} does not follow simulated time: its parameter use_sim_time must be true; '
+                    'a component has it from the request that loads it (LoadNode, parameters), not from '
+                    'its container'
+                )
             # A node that is destroyed loses its entities one by one.
             time.sleep(PERIOD)
         if gone:
