@@ -379,13 +379,13 @@ def _finish(plane: Axes, timelines: Sequence[Timeline]) -> None:
     plane.set_aspect('equal', adjustable='datalim')
     plane.margins(0.2)
     plane.set(xlabel='x [m]', ylabel='y [m]')
-    plane.legend(
-        loc='lower left',
-        bbox_to_anchor=(0.0, 1.0),
-        borderaxespad=0.2,
-        handlelength=3.0,
-        fontsize=min(9.5, 90.0 / len(timelines)),
+    size = min(9.5, 90.0 / len(timelines))
+    legend = plane.legend(
+        loc='lower left', bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, handlelength=3.0, fontsize=size
     )
+    # A long name must not make room for itself beside the path: lines of a title do above it.
+    legend.set_in_layout(False)
+    plane.set_title(' \n' * len(timelines), fontsize=size, linespacing=1.5)
 
 
 def _marks(timelines: Sequence[Timeline], *, uncertain: bool) -> list[Any]:

@@ -162,6 +162,18 @@ def test_everything_drawn_lies_inside_the_picture_whatever_the_users_style(run):
     assert max(box.y1 for box in boxes) <= height
 
 
+@pytest.mark.parametrize('runs', [1, 2, 7, 12])
+def test_long_names_leave_the_path_its_room(run, runs):
+    made = figure([replace(run, path=Path(f'{number}_{60 * "x"}')) for number in range(runs)])
+    made.draw_without_rendering()
+    width, height = made.get_size_inches() * made.dpi
+    plane = made.axes[0]
+    assert plane.get_window_extent().width > 0.3 * width
+    names = plane.get_legend().get_window_extent()
+    assert 0.0 <= names.x0 < names.x1 <= width
+    assert plane.get_window_extent().y1 < names.y0 < names.y1 <= height
+
+
 @pytest.mark.usefixtures('undrawn')
 def test_messages_that_were_skipped_are_reported_in_picture_and_terminal(run, tmp_path):
     wrong = [(10.1, '/joint_command', joint_command(1e308, 0))] * 3
