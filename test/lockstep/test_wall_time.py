@@ -24,6 +24,7 @@ PERIODS = {
     **dict.fromkeys(('posted', 'late', 'waiting'), 20.0),
     # Python computes again for how long is left, and asyncio waits a millisecond longer.
     'queue': 20.001,
+    'children': 21.0,
     'asyncio': 21.0,
 }
 """When each kind of node publishes (ms)."""
@@ -96,7 +97,7 @@ def test_a_node_without_use_sim_time_follows_simulated_time_too():
 @compiled
 def test_what_cannot_follow_is_named():
     with pytest.raises(
-        LockstepError, match=r"calls setitimer, which wall_time='simulated' does not cover"
+        LockstepError, match=r"alarm .* calls setitimer, which wall_time='simulated' does not"
     ):
         run('alarm')
 
@@ -109,10 +110,11 @@ def test_nothing_is_left_open():
     assert len(os.listdir('/proc/self/fd')) <= before
 
 
-def test_a_callback_that_never_returns_is_named():
+@pytest.mark.parametrize('how', ['real', pytest.param('simulated', marks=compiled)])
+def test_a_callback_that_never_returns_is_named(how):
     """A mutex that is locked twice: by the second message."""
     with Lockstep() as world:
-        world.start([sys.executable, str(NODES), 'deadlock'])
+        world.start([sys.executable, str(NODES), 'deadlock'], wall_time=how)
         for _ in range(2):
             world.publish('poke', String())
             world.run_for(0.5)
@@ -129,6 +131,45 @@ def test_a_thread_in_cpp_that_waits_on_wall_time_is_warned_of(monkeypatch):
         world.publish('poke', String())
         with pytest.warns(UserWarning, match='a thread that it has started meanwhile waits with'):
             world.run_for(0.1)
+
+
+@compiled
+def test_a_loop_that_waits_until_it_is_later_gets_later():
+    """By microseconds, after some looks."""
+    (heard, digest), again = run('pipe'), run('pipe')
+    assert (heard, digest) == again
+    times = [time for time, _ in heard]
+    assert times == pytest.approx([20.0 * number for number in range(1, 15)], abs=0.5)
+
+
+@compiled
+def test_slots_of_threads_that_were_killed_are_free_again(monkeypatch):
+    monkeypatch.setattr(wall_time, 'MANY', 2)
+    there = wall_time.WallTime(1)
+    slots = there._slots
+    slots['until'][:4], slots['state'][:4] = [5, 6, 7, 8], wall_time.WAITS
+    slots['thread'][:4] = [2**22 + 1, 2**22 + 2, os.getpid(), 2**22 + 3]
+    there.next()
+    assert there.next() == (7, 2)
+    there.close()
+
+
+def test_a_library_that_cannot_be_built_is_named(monkeypatch, tmp_path):
+    compiler = tmp_path / 'cc'
+    monkeypatch.setenv('PATH', f'{tmp_path}:{os.environ["PATH"]}')
+    for script, words in (
+        ('printf "no \\377" >&2; exit 1', r'(?s)cc .*\.c -ldl fails:\nno'),
+        ('exit 0', 'cannot be built: .*No such file'),
+    ):
+        compiler.write_text(f'#!/bin/sh\n{script}\n')
+        compiler.chmod(0o755)
+        monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+        with pytest.raises(LockstepError, match=words):
+            wall_time.built()
+    for folder, words in (('a b', 'neither spaces nor colons'), ('cc', 'cannot be built: .*Not a dir')):
+        monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / folder))
+        with pytest.raises(LockstepError, match=words):
+            wall_time.built()
 
 
 def test_without_a_compiler_the_error_says_what_it_would_allow(monkeypatch, tmp_path):

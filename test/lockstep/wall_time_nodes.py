@@ -4,10 +4,12 @@ Every 20 ms they publish on `tick` for how long they have run, as their own cloc
 """
 
 import asyncio
+import multiprocessing
 import os
 import queue
 import select
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -74,6 +76,10 @@ def main():
         poll = select.poll()
         poll.register(reader)
         forever(lambda: poll.poll(1000.0 * PERIOD))
+    elif kind == 'pipe':
+        # It looks again until it is later than it was to wait.
+        one, _ = multiprocessing.Pipe()
+        forever(lambda: one.poll(PERIOD))
     elif kind == 'asyncio':
 
         async def ticking():
@@ -109,6 +115,20 @@ def main():
                 both()
 
         threading.Thread(target=loop, daemon=True).start()
+    elif kind == 'children':
+        # They take what waits in this process for files by and by.
+        reader, _ = os.pipe()
+
+        def children():
+            while rclpy.ok():
+                time.sleep(PERIOD)
+                subprocess.run([sys.executable, '-c', 'import time; time.sleep(0.001)'], check=True)
+                tick()
+
+        threading.Thread(target=children, daemon=True).start()
+        threading.Thread(
+            target=lambda: [select.select([reader], [], [], 0.007) for _ in range(100)], daemon=True
+        ).start()
     elif kind == 'deadlock':
         mutex = threading.Lock()
         node.create_subscription(String, 'poke', lambda _: mutex.acquire(), 10)

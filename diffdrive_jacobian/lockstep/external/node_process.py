@@ -263,6 +263,8 @@ class NodeProcess:
         self._wakes = 0
         self._wall_begin = 0
         """Wall time when the world began (ns)."""
+        self._sleepers: set[int] = set()
+        """Threads that sleep in an idle process."""
         self._stuck: int | None = None
         """World time since which a callback has not returned (ns)."""
         self._cpp_threads = 0
@@ -549,7 +551,9 @@ class NodeProcess:
         for pid in self._participants:
             self._datagrams.watch(pid)
         if self._wall_time is not None:
-            self._wall_time.check(self._participants)
+            self._wall_time.check(self.child.title)
+            self._wall_time.check_loaded(self._participants)
+            self._sleepers = self._wall_time.sleeping()
         self._marks = graphs.marks(self._outside)
         self.child.note_shared_memory(self._participants)
         there = {topic for topic, _ in self._outside.get_topic_names_and_types()}
@@ -891,8 +895,9 @@ class NodeProcess:
 
     def _check_callbacks(self) -> None:
         """Check that callbacks return, unless they wait for a response or, by a timeout, for time."""
-        waits = self._wall_time is not None and self._wall_time.next(executors=False) is not None
-        now = self._scheduler.agenda.now
+        asleep = self._wall_time.sleeping() if self._wall_time is not None else set[int]()
+        # Threads that sleep in an idle process, too, end no callback of it: as one that writes logs.
+        waits, now = bool(asleep - self._sleepers), self._scheduler.agenda.now
         if not self._connected or waits or self._unanswered or not self._quiet.stuck():
             self._stuck = None
         elif self._stuck is None:
@@ -968,6 +973,8 @@ class NodeProcess:
             self._refuse(self._take())
             send()
             self._wait()
+            if self._wall_time is not None:
+                self._wall_time.check(self.child.title)
             arrived = self._take()
             self.check_lost()
             for sent in self._sent.values():
@@ -1004,6 +1011,8 @@ class NodeProcess:
         try:
             self._quiet.wait(self._command.patience, asks or self._asks)
         except LockstepError as error:
+            if self._wall_time is not None:
+                self._wall_time.check(self.child.title)
             if self._connected:
                 # What it did may be the cause.
                 self._check_present()

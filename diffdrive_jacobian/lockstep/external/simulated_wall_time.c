@@ -32,6 +32,7 @@
 #include <sys/eventfd.h>
 #include <sys/mman.h>
 #include <sys/select.h>
+#include <sys/socket.h>
 #include <sys/syscall.h>
 #include <sys/time.h>
 #include <sys/timerfd.h>
@@ -50,7 +51,7 @@ struct slot { _Atomic int64_t until; _Atomic int32_t state, thread; /* negative:
 struct page {
   _Atomic int64_t steady, system; /* ns */
   _Atomic int64_t ended;          /* 0; or when real time goes on from there, because the program ends (ns) */
-  _Atomic int32_t turn, full;
+  _Atomic int32_t turn, full, waiters; /* `waiters` of condition variables and semaphores */
   _Atomic int32_t processes[PROCESSES];
   char refused[64]; /* a function that cannot follow simulated time */
   struct slot slots[SLOTS];
@@ -148,36 +149,39 @@ static void count_up(void) {
 }
 
 /* What ends the wait of a slot of this process, for those that do not wait on `turn`. */
-static struct { _Atomic int file; void *_Atomic guard; } ends[SLOTS];
+static struct { int file; void *guard; } ends[SLOTS];
+static pthread_mutex_t ends_mutex = PTHREAD_MUTEX_INITIALIZER;
 static int (*trigger)(const void *);
+static _Thread_local int32_t own_thread;
+static _Thread_local int64_t idle_since, idle_step = 1000;
+static _Thread_local int idle_times;
 
 static struct slot *enter_as(int64_t until, int executor) {
-  static _Thread_local int32_t thread;
-  if (!thread) thread = syscall(SYS_gettid);
-  for (int i = 0; i < SLOTS; i++) {
-    int32_t free = FREE;
-    if (atomic_compare_exchange_strong(&page->slots[i].state, &free, TAKEN)) {
-      page->slots[i].until = until;
-      page->slots[i].thread = executor ? -thread : thread;
-      ends[i].file = 0;
-      ends[i].guard = NULL;
-      page->slots[i].state = WAITS;
-      return &page->slots[i];
+  if (!own_thread) own_thread = syscall(SYS_gettid);
+  for (;;) {
+    int32_t turn = page->turn;
+    for (int i = 0; i < SLOTS; i++) {
+      int32_t free = FREE;
+      if (atomic_compare_exchange_strong(&page->slots[i].state, &free, TAKEN)) {
+        page->slots[i].until = until;
+        page->slots[i].thread = executor ? -own_thread : own_thread;
+        page->slots[i].state = WAITS;
+        return &page->slots[i];
+      }
     }
+    page->full = 1; /* which is an error of the world */
+    futex_wait(&page->turn, turn);
   }
-  page->full = 1;
-  static struct slot none;
-  none.state = DUE;
-  return &none;
+}
+static void end_by(struct slot *slot, int file, void *guard) {
+  pthread_mutex_lock(&ends_mutex);
+  ends[slot - page->slots].file = file;
+  ends[slot - page->slots].guard = guard;
+  pthread_mutex_unlock(&ends_mutex);
 }
 static struct slot *enter(int64_t until) { return enter_as(until, 0); }
 static void leave(struct slot *slot) {
-  long index = slot - page->slots;
-  if (index >= 0 && index < SLOTS) {
-    /* Another process may have the slot next. */
-    ends[index].file = 0;
-    ends[index].guard = NULL;
-  }
+  idle_step = 1000;
   slot->state = FREE;
 }
 static int is_due(struct slot *slot) { return slot->state == DUE || ended(); }
@@ -186,13 +190,16 @@ static void *watch(void *nothing) {
   (void)nothing;
   for (;;) {
     int32_t turn = page->turn;
+    pthread_mutex_lock(&ends_mutex);
     for (int i = 0; i < SLOTS; i++)
       if (is_due(&page->slots[i])) {
-        int file = atomic_exchange(&ends[i].file, 0);
-        void *guard = atomic_exchange(&ends[i].guard, NULL);
-        if (file && write(file - 1, &(uint64_t){1}, 8) < 0) abort();
-        if (guard) trigger(guard);
+        ssize_t written = ends[i].file ? write(ends[i].file, &(uint64_t){1}, 8) : 0;
+        (void)written; /* It is full at most. */
+        if (ends[i].guard) trigger(ends[i].guard);
+        ends[i].file = 0;
+        ends[i].guard = NULL;
       }
+    pthread_mutex_unlock(&ends_mutex);
     futex_wait(&page->turn, turn);
   }
   return NULL;
@@ -208,9 +215,20 @@ static void start_to_watch(void) {
   pthread_sigmask(SIG_SETMASK, &before, NULL);
 }
 
+static _Atomic int watching;
 static void watch_once(void) {
-  static pthread_once_t once = PTHREAD_ONCE_INIT;
-  pthread_once(&once, start_to_watch);
+  if (!atomic_exchange(&watching, 1)) start_to_watch();
+}
+
+static void forked(void) {
+  own_thread = 0;
+  watching = 0;
+  memset(ends, 0, sizeof ends);
+  pthread_mutex_init(&ends_mutex, NULL);
+}
+
+static void refuse(const char *name) {
+  if (page && !page->refused[0]) strncpy(page->refused, name, sizeof page->refused - 1);
 }
 
 __attribute__((constructor)) static void start(void) {
@@ -222,10 +240,27 @@ __attribute__((constructor)) static void start(void) {
   if (mapped == MAP_FAILED) return;
   page = mapped;
   for (int i = 0; i < PROCESSES; i++) {
-    int32_t none = 0;
-    if (atomic_compare_exchange_strong(&page->processes[i], &none, getpid())) break;
+    int32_t there = page->processes[i];
+    if (there && (!kill(there, 0) || errno != ESRCH)) continue;
+    if (atomic_compare_exchange_strong(&page->processes[i], &there, getpid())) break;
   }
+  pthread_atfork(NULL, NULL, forked);
 }
+
+static int sleep_until(int64_t until);
+
+/* A loop that looks at the clock, or for files, without waiting would never end where time stands. */
+static void look(int most) {
+  int64_t time = page->steady;
+  if (idle_since != time) idle_times = 0;
+  idle_since = time;
+  if (ended() || ++idle_times < most) return;
+  int64_t step = idle_step;
+  sleep_until(steady() + step);
+  idle_times = 0;
+  idle_step = step < 1000000 ? 2 * step : step;
+}
+enum { CLOCK_READINGS = 10000, EMPTY_LOOKS = 500 };
 
 /* --- Clocks */
 
@@ -234,6 +269,7 @@ PUBLIC int clock_gettime(clockid_t clock, struct timespec *t) {
   if (!page || !(is_system(clock) || is_steady(clock))) return real(clock, t);
   enum caller caller = who(CALLER);
   if (caller == DDS || caller == STANDARD) return real(clock, t);
+  look(CLOCK_READINGS);
   *t = spec(now(clock));
   return 0;
 }
@@ -252,11 +288,17 @@ PUBLIC time_t time(time_t *t) {
 }
 
 /* std::chrono::steady_clock::now and system_clock::now: what they call would be called by libstdc++. */
-PUBLIC int64_t _ZNSt6chrono3_V212steady_clock3nowEv(void) {
-  return simulated(CALLER) ? now(CLOCK_MONOTONIC) : real_now(CLOCK_MONOTONIC);
+static int64_t chrono_now(void *caller, clockid_t clock) {
+  if (!simulated(caller)) return real_now(clock);
+  look(CLOCK_READINGS);
+  return now(clock);
 }
-PUBLIC int64_t _ZNSt6chrono3_V212system_clock3nowEv(void) {
-  return simulated(CALLER) ? now(CLOCK_REALTIME) : real_now(CLOCK_REALTIME);
+PUBLIC int64_t _ZNSt6chrono3_V212steady_clock3nowEv(void) { return chrono_now(CALLER, CLOCK_MONOTONIC); }
+PUBLIC int64_t _ZNSt6chrono3_V212system_clock3nowEv(void) { return chrono_now(CALLER, CLOCK_REALTIME); }
+
+PUBLIC int timespec_get(struct timespec *t, int base) {
+  *t = spec(chrono_now(CALLER, CLOCK_REALTIME));
+  return base;
 }
 
 /* --- Sleeps */
@@ -312,13 +354,12 @@ PUBLIC unsigned sleep(unsigned seconds) {
 /* --- Condition variables */
 
 static _Atomic uint32_t signals[256];
-static _Atomic int waiters;
 static _Atomic uint32_t *signals_of(const void *address) { return &signals[(uintptr_t)address / 16 % 256]; }
 
 static int wait_signal(pthread_cond_t *condition, pthread_mutex_t *mutex, int64_t until) {
   if (until <= steady()) return ETIMEDOUT;
   _Atomic uint32_t *number = signals_of(condition);
-  waiters++;
+  page->waiters++;
   uint32_t before = *number;
   struct slot *slot = enter(until);
   pthread_mutex_unlock(mutex);
@@ -328,7 +369,7 @@ static int wait_signal(pthread_cond_t *condition, pthread_mutex_t *mutex, int64_
   }
   int timed_out = *number == before && !ended();
   leave(slot);
-  waiters--;
+  page->waiters--;
   pthread_mutex_lock(mutex);
   return timed_out ? ETIMEDOUT : 0;
 }
@@ -348,16 +389,17 @@ PUBLIC int pthread_cond_timedwait(pthread_cond_t *condition, pthread_mutex_t *mu
   if (!page) return real(condition, mutex, t);
   enum caller caller = who(CALLER);
   if (caller == DDS) return real(condition, mutex, t);
-  /* The lock of the interpreter: for 5 ms while another thread of Python runs. */
-  int python = caller == PYTHON;
-  int64_t until = steady() + ns(t) - now(python ? CLOCK_MONOTONIC : CLOCK_REALTIME);
-  if (!python && !ended()) return wait_signal(condition, mutex, until);
-  struct timespec later = real_until(until, python ? CLOCK_MONOTONIC : CLOCK_REALTIME);
+  /* As its attribute says: a bit of the condition variable, since glibc 2.25. */
+  clockid_t clock = condition->__data.__wrefs & 2 ? CLOCK_MONOTONIC : CLOCK_REALTIME;
+  int64_t until = steady() + ns(t) - now(clock);
+  /* Not the lock of the interpreter: for 5 ms while another thread of Python runs. */
+  if (caller != PYTHON && !ended()) return wait_signal(condition, mutex, until);
+  struct timespec later = real_until(until, clock);
   return real(condition, mutex, &later);
 }
 
 static void count_signal(void *address) {
-  if (page && waiters) {
+  if (page && page->waiters) {
     ++*signals_of(address);
     count_up();
   }
@@ -383,10 +425,10 @@ PUBLIC int pthread_cond_broadcast(pthread_cond_t *condition) {
 
 static int wait_semaphore(sem_t *semaphore, int64_t until) {
   int error = 0;
-  waiters++;
+  page->waiters++;
   struct slot *slot = NULL;
   while (sem_trywait(semaphore) && errno == EAGAIN) {
-    if (until <= steady() || (slot && is_due(slot))) {
+    if (slot ? is_due(slot) : until <= steady()) {
       error = ETIMEDOUT;
       break;
     }
@@ -399,7 +441,7 @@ static int wait_semaphore(sem_t *semaphore, int64_t until) {
     }
   }
   if (slot) leave(slot);
-  waiters--;
+  page->waiters--;
   errno = error;
   return error ? -1 : 0;
 }
@@ -425,7 +467,7 @@ PUBLIC int sem_timedwait(sem_t *semaphore, const struct timespec *t) {
 PUBLIC int sem_post(sem_t *semaphore) {
   REAL(sem_post);
   int result = real(semaphore);
-  if (page && waiters) count_up();
+  if (page && page->waiters) count_up();
   return result;
 }
 
@@ -436,15 +478,15 @@ static int wait_files(struct pollfd *files, nfds_t number, int64_t until, const 
   struct pollfd *all = alloca((number + 1) * sizeof *all);
   memcpy(all, files, number * sizeof *all);
   int file = eventfd(0, EFD_CLOEXEC);
+  if (file < 0) refuse("poll without a free file descriptor");
+  if (file < 0) return -1;
   all[number] = (struct pollfd){file, POLLIN, 0};
   watch_once();
   struct slot *slot = enter(until);
-  long index = slot - page->slots;
-  if (index >= 0 && index < SLOTS) {
-    ends[index].file = file + 1;
-    count_up();
-  }
-  int found = index >= 0 && index < SLOTS ? ppoll(all, number + 1, NULL, mask) : 0, error = errno;
+  end_by(slot, file, NULL);
+  if (ended()) count_up();
+  int found = ppoll(all, number + 1, NULL, mask), error = errno;
+  end_by(slot, 0, NULL);
   leave(slot);
   close(file);
   memcpy(files, all, number * sizeof *all);
@@ -462,9 +504,17 @@ PUBLIC int ppoll(struct pollfd *files, nfds_t number, const struct timespec *t, 
 
 PUBLIC int poll(struct pollfd *files, nfds_t number, int ms) {
   REAL(poll);
-  if (ms <= 0 || !simulated(CALLER) || ended()) return real(files, number, ms);
+  if (ms < 0 || !simulated(CALLER) || ended()) return real(files, number, ms);
   int found = real(files, number, 0);
-  return found ? found : wait_files(files, number, steady() + ms * 1000000LL, NULL);
+  if (!found && !ms) look(EMPTY_LOOKS);
+  return found || !ms ? found : wait_files(files, number, steady() + ms * 1000000LL, NULL);
+}
+
+/* With _FORTIFY_SOURCE. */
+PUBLIC int __poll_chk(struct pollfd *files, nfds_t number, int ms, size_t size) {
+  if (size / sizeof *files < number) abort();
+  if (!simulated(CALLER) || ms <= 0 || ended()) return ppoll(files, number, ms < 0 ? NULL : &(struct timespec){ms / 1000, ms % 1000 * 1000000L}, NULL);
+  return poll(files, number, ms);
 }
 
 static int epoll_until(int epoll, struct epoll_event *events, int most, int ms, const sigset_t *mask) {
@@ -514,6 +564,7 @@ PUBLIC int select(int number, fd_set *read, fd_set *write, fd_set *except, struc
   REAL(select);
   if (!t || !simulated(CALLER) || ended()) return real(number, read, write, except, t);
   int64_t duration = t->tv_sec * SECOND + t->tv_usec * 1000LL;
+  if (duration <= 0) look(EMPTY_LOOKS);
   if (duration <= 0) return real(number, read, write, except, t);
   if (!number) return (errno = sleep_until(steady() + duration)) ? -1 : 0;
   return select_until(number, (fd_set *[]){read, write, except}, steady() + duration, NULL);
@@ -556,6 +607,7 @@ PUBLIC long syscall(long number, ...) {
       break;
     }
     long woken = real(449 /* futex_waitv */, both, 2, 0, NULL, 0);
+    if (woken < 0 && (errno == ENOSYS || errno == EPERM)) refuse("a future, which needs Linux 5.16");
     if (woken == 0) break;
     if (woken < 0 && errno == EAGAIN && *(_Atomic uint32_t *)a == (uint32_t)c) continue;
     if (woken < 0) error = errno;
@@ -570,7 +622,8 @@ PUBLIC long syscall(long number, ...) {
 struct guard { void *implementation, *data, *context; };
 struct guards { size_t count; void **entries; };
 struct others { size_t count; void **entries; };
-static struct { void *_Atomic wait_set; struct guard_condition *guard; } sets[64];
+enum { SETS = 256 };
+static struct { void *_Atomic wait_set; struct guard_condition *guard; } sets[SETS];
 struct guard_condition { const char *implementation; void *data; void *context; };
 static pthread_mutex_t sets_mutex = PTHREAD_MUTEX_INITIALIZER;
 
@@ -599,26 +652,29 @@ PUBLIC void *rmw_create_wait_set(void *context, size_t most) {
   struct guard_condition *(*create)(void *) = of_rmw("rmw_create_guard_condition");
   trigger = of_rmw("rmw_trigger_guard_condition");
   watch_once();
+  int i = 0;
   pthread_mutex_lock(&sets_mutex);
-  for (int i = 0; i < 64; i++)
-    if (!sets[i].wait_set) {
-      sets[i].guard = create(context);
-      sets[i].wait_set = wait_set;
-      break;
-    }
+  while (i < SETS && sets[i].wait_set) i++;
+  if (i < SETS) sets[i].guard = create(context);
+  if (i < SETS) sets[i].wait_set = wait_set;
   pthread_mutex_unlock(&sets_mutex);
+  if (i == SETS) refuse("rmw_create_wait_set too often");
   return wait_set;
 }
 
 PUBLIC int rmw_destroy_wait_set(void *wait_set) {
   int (*real)(void *) = of_rmw("rmw_destroy_wait_set");
-  int result = real(wait_set);
-  for (int i = 0; page && i < 64; i++)
+  int (*destroy)(void *) = of_rmw("rmw_destroy_guard_condition");
+  struct guard_condition *guard = NULL;
+  pthread_mutex_lock(&sets_mutex);
+  for (int i = 0; page && i < SETS; i++)
     if (sets[i].wait_set == wait_set) {
-      int (*destroy)(void *) = of_rmw("rmw_destroy_guard_condition");
-      destroy(sets[i].guard);
+      guard = sets[i].guard;
       sets[i].wait_set = NULL;
     }
+  pthread_mutex_unlock(&sets_mutex);
+  int result = real(wait_set);
+  if (guard) destroy(guard);
   return result;
 }
 
@@ -629,6 +685,7 @@ static int any(const struct others *ready) {
 }
 
 struct duration { uint64_t sec, nsec; };
+enum { RMW_RET_TIMEOUT = 2 };
 
 PUBLIC int rmw_wait(
     struct others *subscriptions, struct guards *guards, struct others *services, struct others *clients,
@@ -636,10 +693,13 @@ PUBLIC int rmw_wait(
   static int (*real)(void *, void *, void *, void *, void *, void *, const void *);
   if (!real) real = of_rmw("rmw_wait");
   struct guard_condition *guard = NULL;
-  for (int i = 0; page && i < 64 && !guard; i++)
+  for (int i = 0; page && i < SETS && !guard; i++)
     if (sets[i].wait_set == wait_set) guard = sets[i].guard;
-  if (!t || !(t->sec || t->nsec) || !guard || ended())
-    return real(subscriptions, guards, services, clients, events, wait_set, t);
+  if (!t || !(t->sec || t->nsec) || !guard || ended()) {
+    int result = real(subscriptions, guards, services, clients, events, wait_set, t);
+    if (t && guard && result == RMW_RET_TIMEOUT) look(EMPTY_LOOKS);
+    return result;
+  }
   size_t number = guards ? guards->count : 0;
   void **entries = alloca((number + 1) * sizeof *entries);
   if (number) memcpy(entries, guards->entries, number * sizeof *entries);
@@ -647,23 +707,63 @@ PUBLIC int rmw_wait(
   struct guards more = {number + 1, entries};
   int64_t until = t->sec > INT64_MAX / SECOND / 2 ? INT64_MAX / 2 : steady() + t->sec * SECOND + t->nsec;
   struct slot *slot = enter_as(until, 1);
-  long index = slot - page->slots;
-  if (index >= 0 && index < SLOTS) {
-    ends[index].guard = guard;
-    count_up();
-  }
+  end_by(slot, 0, guard);
+  if (ended()) count_up();
   int result = real(subscriptions, &more, services, clients, events, wait_set, NULL);
+  end_by(slot, 0, NULL);
   leave(slot);
   if (number) memcpy(guards->entries, entries, number * sizeof *entries);
   struct others given = {number, entries};
   int ready = any(subscriptions) || any(&given) || any(services) || any(clients) || any(events);
-  return result ? result : ready ? 0 : 2 /* RMW_RET_TIMEOUT */;
+  return result ? result : ready ? 0 : RMW_RET_TIMEOUT;
 }
 
 /* --- What does not follow */
 
-static void refuse(const char *name) {
-  if (page && !page->refused[0]) strncpy(page->refused, name, sizeof page->refused - 1);
+PUBLIC int pthread_mutex_timedlock(pthread_mutex_t *mutex, const struct timespec *t) {
+  REAL(pthread_mutex_timedlock);
+  if (!simulated(CALLER)) return real(mutex, t);
+  if (pthread_mutex_trylock(mutex) == 0) return 0;
+  refuse("pthread_mutex_timedlock");
+  return ETIMEDOUT;
+}
+
+PUBLIC int pthread_mutex_clocklock(pthread_mutex_t *mutex, clockid_t clock, const struct timespec *t) {
+  REAL(pthread_mutex_clocklock);
+  if (!simulated(CALLER)) return real(mutex, clock, t);
+  if (pthread_mutex_trylock(mutex) == 0) return 0;
+  refuse("pthread_mutex_clocklock (a timed mutex)");
+  return ETIMEDOUT;
+}
+
+#define RWLOCK(name, try, parameters, arguments) \
+  PUBLIC int name parameters { \
+    REAL(name); \
+    if (!simulated(CALLER)) return real arguments; \
+    if (try(lock) == 0) return 0; \
+    refuse(#name); \
+    return ETIMEDOUT; \
+  }
+RWLOCK(pthread_rwlock_timedrdlock, pthread_rwlock_tryrdlock,
+       (pthread_rwlock_t *lock, const struct timespec *t), (lock, t))
+RWLOCK(pthread_rwlock_timedwrlock, pthread_rwlock_trywrlock,
+       (pthread_rwlock_t *lock, const struct timespec *t), (lock, t))
+RWLOCK(pthread_rwlock_clockrdlock, pthread_rwlock_tryrdlock,
+       (pthread_rwlock_t *lock, clockid_t clock, const struct timespec *t), (lock, clock, t))
+RWLOCK(pthread_rwlock_clockwrlock, pthread_rwlock_trywrlock,
+       (pthread_rwlock_t *lock, clockid_t clock, const struct timespec *t), (lock, clock, t))
+
+PUBLIC int sigtimedwait(const sigset_t *set, siginfo_t *info, const struct timespec *t) {
+  REAL(sigtimedwait);
+  if (t && simulated(CALLER)) refuse("sigtimedwait");
+  return real(set, info, t);
+}
+
+PUBLIC int setsockopt(int file, int level, int name, const void *value, socklen_t size) {
+  REAL(setsockopt);
+  if (level == SOL_SOCKET && (name == SO_RCVTIMEO || name == SO_SNDTIMEO) && simulated(CALLER))
+    refuse("setsockopt with SO_RCVTIMEO or SO_SNDTIMEO");
+  return real(file, level, name, value, size);
 }
 
 PUBLIC int timerfd_settime(int file, int flags, const struct itimerspec *t, struct itimerspec *before) {

@@ -26,10 +26,13 @@ WALL_TIMES = ('real', 'simulated')
 SOURCE = Path(__file__).with_name('simulated_wall_time.c')
 VARIABLE = 'LOCKSTEP_WALL_TIME'
 COMPILERS = ('cc', 'gcc', 'clang')
+FLAGS = ('-shared', '-fPIC', '-O2', '-pthread')
 FUTEX = {'x86_64': 202, 'aarch64': 98}
 WAKE, ALL = 1, 2**31 - 1
-WAITS, DUE = 2, 3
-"""States of a slot: somebody waits, and goes on."""
+FREE, WAITS, DUE = 0, 2, 3
+"""States of a slot: nobody has it, somebody waits, and goes on."""
+MANY = 100
+"""Number of slots in use from which those of threads that have ended are looked for."""
 SLOTS, PROCESSES, NAME = 250, 32, 64
 
 
@@ -42,9 +45,10 @@ class _Page(ctypes.Structure):
         ('ended', ctypes.c_int64),
         ('turn', ctypes.c_int32),
         ('full', ctypes.c_int32),
+        ('waiters', ctypes.c_int32),
         ('processes', ctypes.c_int32 * PROCESSES),
         ('refused', ctypes.c_char * NAME),
-        ('slots', ctypes.c_byte * (16 * SLOTS)),
+        ('slots', ctypes.c_int64 * 2 * SLOTS),
     )
 
 
@@ -90,10 +94,18 @@ class WallTime:
         """
         until, state, thread = (self._slots[name] for name in ('until', 'state', 'thread'))
         (waiting,) = np.nonzero((state == WAITS) & (executors | (thread > 0)))
+        if len(waiting) > MANY:
+            self._free_abandoned()
         if not len(waiting):
             return None
         first = min(waiting, key=lambda slot: (until[slot], abs(thread[slot])))
         return int(until[first]), int(first)
+
+    def _free_abandoned(self) -> None:
+        """Free the slots of threads that have ended while they waited: they were killed."""
+        for slot in np.flatnonzero(self._slots['state'] >= WAITS):
+            if not os.path.exists(f'/proc/{abs(self._slots["thread"][slot])}'):
+                self._slots['state'][slot] = FREE
 
     def sleeping(self) -> set[int]:
         """Return the threads that wait for a time, without executors."""
@@ -118,12 +130,15 @@ class WallTime:
             self._page.ended = time.monotonic_ns()
             self._wake()
 
-    def check(self, pids: set[int]) -> None:
-        """Raise LockstepError if processes do not follow it, or use what does not."""
+    def check(self, title: str) -> None:
+        """Raise LockstepError if a process uses what does not follow it. The error names it so."""
         refused = self._page.refused.decode(errors='replace')
         if refused or self._page.full:
             what = f'calls {refused}' if refused else f'waits in more than {SLOTS} threads'
-            raise LockstepError(f"it {what}, which wall_time='simulated' does not cover")
+            raise LockstepError(f"{title} {what}, which wall_time='simulated' does not cover")
+
+    def check_loaded(self, pids: set[int]) -> None:
+        """Raise LockstepError if processes have not loaded the library."""
         if missing := pids - set(self._page.processes):
             raise LockstepError(
                 f'process {min(missing)} does not load the library for simulated wall time: it is '
@@ -150,6 +165,11 @@ def built() -> Path:
     known = hashlib.sha256(source + ' '.join((platform.machine(), *platform.libc_ver())).encode())
     root = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache')
     library = root / 'diffdrive_jacobian' / f'simulated_wall_time-{known.hexdigest()[:16]}.so'
+    if set(str(library)) & set(' :'):
+        raise LockstepError(
+            f'the library for simulated wall time cannot be kept in {library.parent}: LD_PRELOAD allows '
+            'neither spaces nor colons; XDG_CACHE_HOME may be another folder'
+        )
     if library.exists():
         return library
     compiler = next(filter(None, map(shutil.which, COMPILERS)), None)
@@ -159,13 +179,15 @@ def built() -> Path:
             'one (apt install gcc libc6-dev) wall timers and sleeps follow simulated time; without, '
             "wall_time='real' takes nodes whose timers are on the clock of the node"
         )
-    library.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-        made = Path(folder, library.name)
-        command = [compiler, '-shared', '-fPIC', '-O2', '-pthread', '-o', str(made), str(SOURCE), '-ldl']
-        try:
-            subprocess.check_output(command, stderr=subprocess.STDOUT, text=True)
-        except subprocess.CalledProcessError as error:
-            raise LockstepError(f'{" ".join(command)} fails:\n{error.output}') from error
-        made.replace(library)
+    try:
+        library.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=library.parent) as folder:
+            made = Path(folder, library.name)
+            command = [compiler, *FLAGS, '-o', str(made), str(SOURCE), '-ldl']
+            subprocess.check_output(command, stderr=subprocess.STDOUT, errors='replace')
+            made.replace(library)
+    except subprocess.CalledProcessError as error:
+        raise LockstepError(f'{" ".join(command)} fails:\n{error.output}') from error
+    except OSError as error:
+        raise LockstepError(f'the library for simulated wall time cannot be built: {error}') from error
     return library
