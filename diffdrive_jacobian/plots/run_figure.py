@@ -385,7 +385,7 @@ def _finish(plane: Axes, timelines: Sequence[Timeline]) -> None:
     )
     # A long name must not make room for itself beside the path: lines of a title do above it.
     legend.set_in_layout(False)
-    plane.set_title(' \n' * len(timelines), fontsize=size, linespacing=1.5)
+    plane.set_title(' \n' * len(timelines), fontsize=size, linespacing=1.65)
 
 
 def _marks(timelines: Sequence[Timeline], *, uncertain: bool) -> list[Any]:
