@@ -777,7 +777,7 @@ class NodeProcess:
     def _await_response(self, name: str, allowance: Allowance) -> None:
         """Ask a node for a parameter until it has responded to the last request, so to all of them."""
         client = self._outside.create_client(GetParameters, name)
-        begin, number, response = time.monotonic(), 0, None
+        begin, periods, number, response = time.monotonic(), 0, 0, None
         while not number or response is None or response[0] != number:
             self.child.check_running()
             if allowance.is_used_up():
@@ -790,13 +790,15 @@ class NodeProcess:
             if graph_changed(self._outside):
                 # The node may wait for a service of the world before it spins.
                 self._learn()
-            overdue = response is None and time.monotonic() > begin + number * REPETITION
-            if number and response is None and time.monotonic() > begin + STARTING:
+            passed = time.monotonic() - begin
+            if number and passed > STARTING:
                 self._sleep_on()
-            if overdue and client.service_is_ready():
-                number = send_request(client, GetParameters.Request(names=['use_sim_time']))
+            if passed > periods * REPETITION and client.service_is_ready():
+                periods += 1
+                if response is None:
+                    number = send_request(client, GetParameters.Request(names=['use_sim_time']))
                 self._wait()
-                if number > 1 and not self._quiet.spins():
+                if periods > 1 and not self._spins():
                     # A loop may wait for the time, as by a Rate on the clock of the node.
                     self._before = min(self._before + BEFORE // 20, 0)
                     self._send_time(self._before)
@@ -806,10 +808,13 @@ class NodeProcess:
 
     def _sleep_on(self) -> None:
         """Let a process that sleeps before its nodes spin go on, in simulated wall time."""
-        if self._wall_time is None or not self._quiet.is_quiet() or self._quiet.spins():
+        if self._wall_time is None or not self._quiet.is_quiet() or self._spins():
             return
         if self._wall_time.sleep_on():
             self._wait()
+
+    def _spins(self) -> bool:
+        return self._quiet.spins() if self._wall_time is None else self._wall_time.spins
 
     def _untimed(self) -> list[str]:
         """Return the nodes that should receive the time and do not, as far as is discovered."""

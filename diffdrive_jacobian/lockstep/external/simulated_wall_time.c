@@ -52,6 +52,7 @@ struct page {
   _Atomic int64_t steady, system; /* ns */
   _Atomic int64_t ended;          /* 0; or when real time goes on from there, because the program ends (ns) */
   _Atomic int32_t turn, full, waiters; /* `waiters` of condition variables and semaphores */
+  _Atomic int32_t spinning;            /* main threads in `rmw_wait` */
   _Atomic int32_t processes[PROCESSES];
   char refused[64]; /* a function that cannot follow simulated time */
   struct slot slots[SLOTS];
@@ -687,7 +688,7 @@ static int any(const struct others *ready) {
 struct duration { uint64_t sec, nsec; };
 enum { RMW_RET_TIMEOUT = 2 };
 
-PUBLIC int rmw_wait(
+static int wait_in_rmw(
     struct others *subscriptions, struct guards *guards, struct others *services, struct others *clients,
     struct others *events, void *wait_set, const struct duration *t) {
   static int (*real)(void *, void *, void *, void *, void *, void *, const void *);
@@ -716,6 +717,16 @@ PUBLIC int rmw_wait(
   struct others given = {number, entries};
   int ready = any(subscriptions) || any(&given) || any(services) || any(clients) || any(events);
   return result ? result : ready ? 0 : RMW_RET_TIMEOUT;
+}
+
+PUBLIC int rmw_wait(
+    struct others *subscriptions, struct guards *guards, struct others *services, struct others *clients,
+    struct others *events, void *wait_set, const struct duration *t) {
+  int spins = page && (!t || t->sec || t->nsec) && syscall(SYS_gettid) == getpid();
+  if (spins) page->spinning++;
+  int result = wait_in_rmw(subscriptions, guards, services, clients, events, wait_set, t);
+  if (spins) page->spinning--;
+  return result;
 }
 
 /* --- What does not follow */

@@ -46,6 +46,7 @@ class _Page(ctypes.Structure):
         ('turn', ctypes.c_int32),
         ('full', ctypes.c_int32),
         ('waiters', ctypes.c_int32),
+        ('spinning', ctypes.c_int32),
         ('processes', ctypes.c_int32 * PROCESSES),
         ('refused', ctypes.c_char * NAME),
         ('slots', ctypes.c_int64 * 2 * SLOTS),
@@ -85,6 +86,11 @@ class WallTime:
     def give(self, steady: int, system: int) -> None:
         """Set both times (ns). Nobody goes on by that."""
         self._page.steady, self._page.system = steady, system
+
+    @property
+    def spins(self) -> bool:
+        """Whether the main thread of a process waits in an executor."""
+        return bool(self._page.spinning > 0)
 
     def next(self, *, executors: bool = True) -> tuple[int, int] | None:
         """Return until when is waited for (ns), and the slot: the earliest, of the oldest thread.
