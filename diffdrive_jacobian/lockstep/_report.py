@@ -27,6 +27,8 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep._link import Source
 
+REPORT = 'last messages'
+"""Beginning of the report."""
 MAX_SHOWN = 4
 """Number of elements that are shown of an array."""
 MAX_TEXT = 80
@@ -79,7 +81,7 @@ def describe(
     if missing := [node.get_fully_qualified_name() for node in existing if node not in nodes]:
         lines.append(f'  created, but not added to lockstep: {", ".join(sorted(missing))}')
     clock, passed = now / NANOSECONDS, world_time / NANOSECONDS
-    title = f'last messages, at {clock:g} s of the clock, {passed:g} s after the start:'
+    title = f'{REPORT}, at {clock:g} s of the clock, {passed:g} s after the start:'
     return '\n'.join([title, *(lines or ['  none'])])
 
 

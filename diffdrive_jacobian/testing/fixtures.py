@@ -147,6 +147,7 @@ def pytest_runtest_call(item: pytest.Item) -> None:
     if world is None:
         return
     from diffdrive_jacobian.lockstep._errors import LockstepError
+    from diffdrive_jacobian.lockstep._report import REPORT
     from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.recording.recording import RecordingError
     from diffdrive_jacobian.testing.recorded_run import GoldenRun, GoldenRunError
@@ -158,7 +159,7 @@ def pytest_runtest_call(item: pytest.Item) -> None:
             golden.check()
         return
     except LockstepError as error:
-        item.stash[_CONTAINED] = True
+        item.stash[_CONTAINED] = REPORT in str(error)
         problem = str(error)
     except (GoldenRunError, RecordingError) as error:
         problem = str(error)
@@ -179,10 +180,12 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     if not report.failed or world is None:
         return
     from diffdrive_jacobian.lockstep._errors import LockstepError
+    from diffdrive_jacobian.lockstep._report import REPORT
     from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
-    contained = call.excinfo is not None and call.excinfo.errisinstance(LockstepError)
+    error = call.excinfo.value if call.excinfo is not None else None
+    contained = isinstance(error, LockstepError) and REPORT in str(error)
     contained = item.stash.get(_CONTAINED, contained)
     if isinstance(world, Lockstep) and not contained:
         report.sections.append(('lockstep', _or_error(world.report)))

@@ -91,6 +91,8 @@ END = 2.0
 """Time in which a process ends after a process of its nodes has (s)."""
 SYNCHRONOUS = {'RMW_FASTRTPS_PUBLICATION_MODE': 'SYNCHRONOUS'}
 """Environment of processes: a thread of Fast DDS would publish later what is published at once."""
+SIMULATED = "start(..., wall_time='simulated')"
+"""What lets a program that lives by wall time take part."""
 BEFORE = NANOSECONDS
 """For how long before it takes part a process may have the time that it waits for to start (ns)."""
 WAKES = 20
@@ -134,6 +136,10 @@ class Command:
             )
         if not (self.cwd is None or _is_text(self.cwd)):
             raise _error('cwd must be a path', self.cwd)
+        if self.cwd is not None and not os.path.isdir(self.cwd):
+            raise _error('cwd must be a folder that exists', self.cwd)
+        if not isinstance(self.use_sim_time, bool):
+            raise _error('use_sim_time must be True or False', self.use_sim_time)
         if not isinstance(self.env, Mapping) or not all(map(_is_variable, self.env.items())):
             raise _error("env must be names with texts, {'NAME': 'value'}", self.env)
         if any(self.env.get(name, value) != value for name, value in SYNCHRONOUS.items()):
@@ -920,7 +926,7 @@ class NodeProcess:
     def _warn_of(self, what: str, stacklevel: int = 6) -> None:
         warnings.warn(
             f'{self.child.title}: {what}: that is wall time, so what it does differs from run to run; '
-            "start(..., wall_time='simulated')",
+            f'{SIMULATED}',
             stacklevel=stacklevel,
         )
 
@@ -1022,10 +1028,15 @@ class NodeProcess:
                 # What it did may be the cause.
                 self._check_present()
             names = ', '.join(self._stand_ins) or self.child.title
+            if self._wall_time is None:
+                remedy = f'a loop or a thread that sleeps or waits on wall time: {SIMULATED}'
+            else:
+                remedy = (
+                    'a loop that polls cannot run in lockstep, also in a program that it has started'
+                )
             raise LockstepError(
-                f'{names} {error}\n  a loop that polls or sleeps on wall time cannot run in lockstep, '
-                'also in a program that it has started; for a callback that takes longer: '
-                'start(..., patience=)\n' + self.describe()
+                f'{names} {error}\n  {remedy}; a callback that takes longer: start(..., patience=)\n'
+                + self.describe()
             ) from None
 
     @contextmanager
@@ -1123,7 +1134,8 @@ class NodeProcess:
                 'to it: what it sends then differs from run to run. Likely '
                 f'{"" if self._command.use_sim_time else "use_sim_time=False, "}a timer on wall time '
                 '(create_wall_timer), a thread of its own, or a callback that had not ended, because it '
-                'waited for something else than a message\n' + self.describe()
+                'waited for something else than a message'
+                f'{"; " + SIMULATED if self._wall_time is None else ""}\n' + self.describe()
             )
 
     def _on_end(self) -> None:

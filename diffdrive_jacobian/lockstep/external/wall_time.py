@@ -195,5 +195,8 @@ def built() -> Path:
     except subprocess.CalledProcessError as error:
         raise LockstepError(f'{" ".join(command)} fails:\n{error.output}') from error
     except OSError as error:
-        raise LockstepError(f'the library for simulated wall time cannot be built: {error}') from error
+        raise LockstepError(
+            f'the library for simulated wall time cannot be built in {library.parent} '
+            f'(XDG_CACHE_HOME): {error}'
+        ) from error
     return library
