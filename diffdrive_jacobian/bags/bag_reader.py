@@ -19,7 +19,7 @@ from diffdrive_jacobian.bags.corrected_reader import CorrectedReader
 from diffdrive_jacobian.bags.files import NotARegularFileError, check_regular, is_recoverable, journal_of
 from diffdrive_jacobian.bags.journal import PARAMETERS
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.numerics.fields import (
+from diffdrive_jacobian.numerics.checks import (
     integer,
     mapping,
     nonempty,

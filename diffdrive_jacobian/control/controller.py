@@ -31,15 +31,16 @@ from diffdrive_jacobian.control.path import Reference
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import (
+    Checked,
     Finite,
     array,
-    boolean,
-    finite,
+    between,
     function,
-    number,
+    instance,
     numbers,
+    optional,
+    short,
 )
-from diffdrive_jacobian.numerics.fields import Checked, Text, between, instance, optional, short
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Law = Callable[..., tuple[Any, ...]]
@@ -66,14 +67,14 @@ class Gain(Checked):
     """Name of the parameter: a lower-case letter, then letters, digits or `_`, at most 32. Laws with a
     gain of the same name share the parameter, and must give it the same unit and bounds."""
     default: Finite
-    unit: Text = '1/s'
-    description: Text = 'Gain'
+    unit: str = '1/s'
+    description: str = 'Gain'
     """What it acts on, for help texts."""
     bounds: tuple[float, float] = (-LARGEST_GAIN, LARGEST_GAIN)
     """Smallest and largest value."""
-    above: Annotated[float | None, optional(partial(number, check=finite))] = None
+    above: Finite | None = None
     """Lower bound that is itself not allowed, besides `bounds`."""
-    label: Text = ''
+    label: str = ''
     """Label on the page; default: the name."""
     usual: tuple[float, float] = (math.nan, math.nan)
     """Range of the slider and of sweeps; default: from a tenth to three times the default value."""
@@ -162,7 +163,7 @@ class ControlLaw(Checked):
     """Name by which it is chosen: a letter, then letters, digits, `_`, `.` or `-`, at most 64."""
     law: Annotated[Law, function]
     """The law, `law(poses, goals, *gains) -> (v, omega)`."""
-    summary: Text = ''
+    summary: str = ''
     """One sentence for help texts."""
     gains: tuple[Gain, ...] = (KP, KV)
     """Gains that are passed to the law, in this order."""
@@ -226,7 +227,7 @@ class Controller(ControlLaw):
     and `law` are required. An invalid field raises ValueError.
     """
 
-    takes_heading: Annotated[bool, boolean] = False
+    takes_heading: bool = False
     """Whether the law takes the heading of the goal. The robot then always turns to it at the end."""
     offset: str = ''
     """Name of the gain that is the x coordinate of the driven point in the body frame; empty: the law

@@ -17,7 +17,7 @@ from diffdrive_jacobian.control.controller import ControlLaw, Controller, PathCo
 from diffdrive_jacobian.control.goal_laws import GOAL_CONTROLLERS
 from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.numerics.fields import instance, short
+from diffdrive_jacobian.numerics.checks import instance, short
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

@@ -21,9 +21,8 @@ from diffdrive_jacobian.control.controller import BoundLaw
 from diffdrive_jacobian.control.goal_laws import turn_in_place
 from diffdrive_jacobian.control.path import Path, Reference
 from diffdrive_jacobian.control.waypoints import Law
-from diffdrive_jacobian.numerics.checks import NotNegative, Positive
+from diffdrive_jacobian.numerics.checks import Checked, NotNegative, Positive
 from diffdrive_jacobian.numerics.elementary import wrap
-from diffdrive_jacobian.numerics.fields import Checked
 
 STEPS = 8
 """Number of steps in which the point at the look-ahead distance is searched."""

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.path import Path
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.numerics.checks import finite, number
-from diffdrive_jacobian.numerics.fields import between, short
+from diffdrive_jacobian.numerics.checks import between, finite, number, short
 from diffdrive_jacobian.text import format_size, printable
 
 Floats = NDArray[np.float64]

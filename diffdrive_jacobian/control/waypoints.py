@@ -26,12 +26,13 @@ from diffdrive_jacobian.numerics.checks import (
     constant,
     finite,
     function,
+    instance,
+    integer,
     number,
     numbers,
     read_only,
 )
 from diffdrive_jacobian.numerics.elementary import hypot, wrap
-from diffdrive_jacobian.numerics.fields import instance, integer
 from diffdrive_jacobian.numerics.formula import Number, formula
 
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
@@ -68,7 +69,7 @@ class Arrival(Comparable):
     """Largest distance to a goal that counts as arrived (m)."""
     yaw_tolerance: NotNegative = 0.02
     """Largest heading error at the goal, if the heading counts (rad)."""
-    use_heading: Annotated[bool, boolean] = False
+    use_heading: bool = False
     """Whether the heading of the last goal counts."""
     offset: Annotated[Any, partial(constant, check=finite)] = 0.0
     """X coordinate in the body frame of the point that is to arrive (m), a number or an array."""

@@ -31,8 +31,7 @@ from diffdrive_jacobian.exploration.result import Exploration, Finding
 from diffdrive_jacobian.exploration.scenario import ExplorationError, Scenario, ScenarioName, Source
 from diffdrive_jacobian.exploration.schedules import StopShrinking, generate, shrink, st, trials
 from diffdrive_jacobian.exploration.trial import Outcome, Setting, Trial, Violation
-from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
-from diffdrive_jacobian.numerics.fields import integer
+from diffdrive_jacobian.numerics.checks import integer, number, positive_or_infinite
 from diffdrive_jacobian.properties import Property
 from diffdrive_jacobian.signals import one_interrupt
 from diffdrive_jacobian.text import error_text

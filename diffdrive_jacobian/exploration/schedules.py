@@ -22,8 +22,8 @@ from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.exploration.scenario import ExplorationError
 from diffdrive_jacobian.exploration.trial import Trial
 from diffdrive_jacobian.faults import Fault
-from diffdrive_jacobian.numerics.fields import between, integer
-from diffdrive_jacobian.numerics.fields import names as check_names
+from diffdrive_jacobian.numerics.checks import between, integer
+from diffdrive_jacobian.numerics.checks import names as check_names
 
 try:
     import hypothesis

@@ -20,8 +20,7 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.lockstep._injection import Undo as Undo
-from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
-from diffdrive_jacobian.numerics.fields import Checked, Text, nonempty
+from diffdrive_jacobian.numerics.checks import Checked, NotNegative, PositiveOrInfinite, nonempty
 
 LONG, SHOWN = 8, 2
 """Length beyond which a message shows the beginning of a sequence only, and how many elements of it."""
@@ -170,7 +169,7 @@ class TopicFault(Fault):
     """
 
     topic: RosName
-    node: Text = field(default='', kw_only=True)
+    node: str = field(default='', kw_only=True)
 
     keeps_order: ClassVar[bool] = False
     """Whether a message never overtakes an earlier one, also not after the fault has ended."""

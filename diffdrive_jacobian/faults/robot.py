@@ -19,8 +19,15 @@ from diffdrive_jacobian.faults.fault import Fault, Undo
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.numerics.checks import Finite, Positive, between, boolean, number
-from diffdrive_jacobian.numerics.fields import Name, integer, one_of
+from diffdrive_jacobian.numerics.checks import (
+    Finite,
+    Name,
+    Positive,
+    between,
+    integer,
+    number,
+    one_of,
+)
 from diffdrive_jacobian.simulation.actuators import Actuators, time_constant
 from diffdrive_jacobian.simulation.encoders import MAX_PER_REVOLUTION
 from diffdrive_jacobian.simulation.robot import RobotModel
@@ -211,7 +218,7 @@ class Push(RobotFault):
     dx: Finite = 0.0
     dy: Finite = 0.0
     dtheta: Finite = 0.0
-    noticed: Annotated[bool, boolean] = False
+    noticed: bool = False
 
     at_once: ClassVar[bool] = True
 

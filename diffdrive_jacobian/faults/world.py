@@ -20,8 +20,7 @@ from diffdrive_jacobian.faults.fault import Fault, RosName, Undo
 from diffdrive_jacobian.lockstep._clock import MAX_SECONDS
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._injection import Injection
-from diffdrive_jacobian.numerics.checks import Positive, PositiveOrInfinite, between
-from diffdrive_jacobian.numerics.fields import Name
+from diffdrive_jacobian.numerics.checks import Name, Positive, PositiveOrInfinite, between
 from diffdrive_jacobian.ros.rclpy_internals import PARAMETERS_OF_RCLPY, declared_parameters
 from diffdrive_jacobian.time_units import in_seconds, nanoseconds
 

@@ -43,9 +43,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics.singular_values import EPS, column, dot, outer, svd, times
-from diffdrive_jacobian.numerics.checks import array, floats, leading, not_negative, number, positive
+from diffdrive_jacobian.numerics.checks import (
+    array,
+    floats,
+    integer,
+    leading,
+    not_negative,
+    number,
+    positive,
+)
 from diffdrive_jacobian.numerics.elementary import wrap
-from diffdrive_jacobian.numerics.fields import integer
 from diffdrive_jacobian.numerics.formula import Entries, Vector, entries_first, formula
 
 __all__ = ['METHODS', 'IKResult', 'pose_difference', 'solve']

@@ -80,9 +80,9 @@ from diffdrive_jacobian.numerics.checks import (
     positive,
     positive_or_infinite,
     shaped,
+    short,
 )
 from diffdrive_jacobian.numerics.elementary import minimum
-from diffdrive_jacobian.numerics.fields import short
 from diffdrive_jacobian.numerics.formula import (
     Array,
     Number,
@@ -281,7 +281,8 @@ def prioritized(
         weights=() if weights is None else weights.shape[:-1],
     )
     axes = len(batch)
-    damping, W_half = entries_first(damping, 0, axes), root(entries_first(weights, 1, axes))
+    damping = entries_first(damping, 0, axes)
+    W_half = root(None if weights is None else entries_first(weights, 1, axes))
     q_dot, N = np.zeros((n, *batch)), np.eye(n).reshape(n, n, *[1] * axes)
     for k, (J_k, x_k) in enumerate(pairs):
         J, x_dot = entries_first(J_k, 2, axes) / W_half, entries_first(x_k, 1, axes)
@@ -318,7 +319,7 @@ def _checked(tasks: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[Array, 
 
 
 @formula('(m,n) -> ()')
-def manipulability(J: Any) -> Array:
+def manipulability(J: Any) -> Number:
     """Return Yoshikawa's distance of a Jacobian from singular: `w = sqrt(det(J J^T))`.
 
     It is the product of the singular values, shape (...), 0 where J is singular. Also 0 where it has
@@ -348,10 +349,10 @@ def manipulability_gradient(jacobian: Callable[[Array], ArrayLike], q: ArrayLike
     steps = STEP * np.eye(q.shape[-1])
     around = q[..., np.newaxis, :]
     above, below = manipulability(jacobian(around + steps)), manipulability(jacobian(around - steps))
-    if above.shape != q.shape:
+    if np.shape(above) != q.shape:
         raise ValueError(
             f'jacobian must return one Jacobian for each configuration, shape (*{q.shape}, m, n), got '
-            f'manipulabilities of shape {above.shape}'
+            f'manipulabilities of shape {np.shape(above)}'
         )
     return np.asarray((above - below) / (2.0 * STEP))
 

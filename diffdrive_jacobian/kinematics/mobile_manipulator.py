@@ -14,7 +14,6 @@ Source: document A, 3.2.4, "Mobile Manipulators"; doc/mathematics.md, "Manipulat
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -23,9 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body, wheel_to_world_jacobian
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm, arm_forward_kinematics, arm_jacobian
-from diffdrive_jacobian.numerics.checks import Positive, array, numbers, read_only
+from diffdrive_jacobian.numerics.checks import Checked, Positive, array, numbers, read_only
 from diffdrive_jacobian.numerics.elementary import cos, product, sin
-from diffdrive_jacobian.numerics.fields import Checked, instance
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 __all__ = ['MobileManipulator', 'mobile_manipulator_jacobian']
@@ -79,7 +77,7 @@ class MobileManipulator(Checked):
     """Wheel radius (m)."""
     L: Positive
     """Wheel separation (m)."""
-    arm: Annotated[PlanarArm, partial(instance, wanted=PlanarArm)]
+    arm: PlanarArm
     """Its x axis points forward."""
     mount: Annotated[Any, _mount] = (0.0, 0.0)
     """Position of the arm's base in the frame of the axle centre, `[m_x, m_y]` (m)."""

@@ -17,6 +17,7 @@ from diffdrive_jacobian.numerics.checks import (
     Comparable,
     anything,
     constant,
+    instance,
     leading,
     not_negative_or_infinite,
     not_positive_or_infinite,
@@ -24,7 +25,6 @@ from diffdrive_jacobian.numerics.checks import (
     positive_or_infinite,
 )
 from diffdrive_jacobian.numerics.elementary import all_finite, maximum, minimum, where
-from diffdrive_jacobian.numerics.fields import instance
 from diffdrive_jacobian.numerics.formula import Number, formula
 
 ROUNDING = 2.0**-49

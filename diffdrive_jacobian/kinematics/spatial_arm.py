@@ -36,9 +36,8 @@ from diffdrive_jacobian.kinematics.spatial import (
     rigid,
     spatial_displacement_jacobian,
 )
-from diffdrive_jacobian.numerics.checks import array, finite, floats
+from diffdrive_jacobian.numerics.checks import array, finite, floats, integer, one_of
 from diffdrive_jacobian.numerics.elementary import cos, product, sin
-from diffdrive_jacobian.numerics.fields import integer, one_of
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 __all__ = ['IIWA', 'PANDA', 'UR5', 'SpatialArm']

@@ -13,7 +13,7 @@ from typing import Annotated, Any, NoReturn
 
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.conversion import MAX_POSITION, MAX_SPEED
-from diffdrive_jacobian.numerics.fields import Checked, between, boolean, optional, short
+from diffdrive_jacobian.numerics.checks import Checked, between, optional, short
 
 MAX_SIZE = 4096
 """Largest size of a command (bytes)."""
@@ -44,7 +44,6 @@ def _setting(name: str, value: Any) -> float | str | bool | None:
 
 _angle = between(-math.tau, math.tau, unit='rad')
 _Text = Annotated[str, _text]
-_Flag = Annotated[bool, boolean]
 _Position = Annotated[float, between(-MAX_POSITION, MAX_POSITION, unit='m')]
 _Velocity = Annotated[float, between(-MAX_SPEED, MAX_SPEED)]
 
@@ -70,7 +69,7 @@ class SendGoal(RobotCommand):
     y: _Position
     theta: Annotated[float | None, optional(_angle)]
     """Heading at the goal (rad). None: the direction from which the robot comes."""
-    append: _Flag
+    append: bool
     """Whether it is a further waypoint after the present goals."""
 
 
@@ -121,7 +120,7 @@ class SetParameter(RobotCommand):
 class Pause(Command):
     """Stop or continue simulated time, or a bag."""
 
-    paused: _Flag
+    paused: bool
 
 
 class Step(Command):

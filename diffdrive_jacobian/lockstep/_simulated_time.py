@@ -15,7 +15,7 @@ from diffdrive_jacobian.lockstep._clock import MAX_SECONDS
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
-from diffdrive_jacobian.numerics.fields import between
+from diffdrive_jacobian.numerics.checks import between
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
 from diffdrive_jacobian.time_units import NANOSECONDS
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.numerics import fields
+from diffdrive_jacobian.numerics import checks
 from diffdrive_jacobian.text import printable
 
 MAX_LENGTH = 256
@@ -58,9 +58,9 @@ class Specification:
         """The values allowed, in words."""
         words = []
         if self.choices:
-            words.append(fields.choices(self.choices))
+            words.append(checks.choices(self.choices))
         if self.low is not None and self.high is not None:
-            words.append(fields.interval(self.low, self.high, self.above))
+            words.append(checks.interval(self.low, self.high, self.above))
         if self.nan_is_none:
             words.append('or .nan for none')
         return ' '.join(words)
@@ -84,7 +84,7 @@ class Specification:
             return self.nan_is_none
         if self.low is None or self.high is None:
             return True
-        return fields.inside(value, self.low, self.high, self.above)
+        return checks.inside(value, self.low, self.high, self.above)
 
 
 def parameter(

@@ -14,7 +14,6 @@ from rclpy.publisher import Publisher
 from diffdrive_jacobian.faults.fault import Expression, RosName
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.names import full_name
-from diffdrive_jacobian.numerics.fields import Text
 from diffdrive_jacobian.properties._messages import Pose, Twist, read_pose, read_twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -35,7 +34,7 @@ class Property(Expression, ABC):
         namespace: Namespace of the topics, such as '/robot1' (default: that of the `Lockstep`).
     """
 
-    namespace: Text = field(default='', kw_only=True)
+    namespace: str = field(default='', kw_only=True)
 
     @abstractmethod
     def watch(self, world: Lockstep) -> Watch:

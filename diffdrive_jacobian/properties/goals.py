@@ -22,8 +22,7 @@ from diffdrive_jacobian.messages.goal_status import (
     GoalState,
     Stamp,
 )
-from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
-from diffdrive_jacobian.numerics.fields import Names
+from diffdrive_jacobian.numerics.checks import Names, NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.properties._messages import Pose, Twist, field_reader, planar, read_twist
 from diffdrive_jacobian.properties.base import (
     ROUNDING,

@@ -18,12 +18,12 @@ from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.codecs import PATH
 from diffdrive_jacobian.messages.conversion import MAX_POSITION, MessageError
 from diffdrive_jacobian.numerics.checks import (
+    Names,
     NotNegative,
     NotNegativeOrInfinite,
     Positive,
     PositiveOrInfinite,
 )
-from diffdrive_jacobian.numerics.fields import Names
 from diffdrive_jacobian.properties._messages import Pose, Twist, field_reader, read_twist
 from diffdrive_jacobian.properties.base import (
     ROUNDING,

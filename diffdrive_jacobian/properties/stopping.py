@@ -12,7 +12,6 @@ from rclpy.publisher import Publisher
 from diffdrive_jacobian.faults.fault import RosName
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.numerics.checks import NotNegative
-from diffdrive_jacobian.numerics.fields import Text
 from diffdrive_jacobian.properties._messages import Twist, read_twist
 from diffdrive_jacobian.properties.base import (
     ROUNDING,
@@ -39,7 +38,7 @@ class ReactionProperty(MotionProperty):
     """
 
     within: NotNegative
-    node: Text = field(default='', kw_only=True)
+    node: str = field(default='', kw_only=True)
     commands: RosName = field(default='cmd_vel', kw_only=True)
 
 
@@ -223,7 +222,7 @@ class StopsOnShutdown(Property):
         commands: Topic of type Twist or TwistStamped (default: 'cmd_vel').
     """
 
-    node: Text = field(default='', kw_only=True)
+    node: str = field(default='', kw_only=True)
     commands: RosName = field(default='cmd_vel', kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:

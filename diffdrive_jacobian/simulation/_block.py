@@ -21,9 +21,17 @@ from diffdrive_jacobian.control.controllers import ControllerError, find_control
 from diffdrive_jacobian.control.goal_laws import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
-from diffdrive_jacobian.numerics.checks import array, floats, function, leading, number, positive
+from diffdrive_jacobian.numerics.checks import (
+    array,
+    floats,
+    function,
+    instance,
+    leading,
+    number,
+    optional,
+    positive,
+)
 from diffdrive_jacobian.numerics.elementary import wrap
-from diffdrive_jacobian.numerics.fields import instance, optional
 from diffdrive_jacobian.simulation._following import Follower
 from diffdrive_jacobian.simulation.actuators import Actuators
 

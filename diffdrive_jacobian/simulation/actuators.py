@@ -13,10 +13,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Annotated, NamedTuple, Protocol, TypeAlias
 
 from diffdrive_jacobian.numerics.checks import (
+    Checked,
     NotNegativeOrInfinite,
     PositiveOrInfinite,
     nanoseconds,
@@ -24,8 +24,8 @@ from diffdrive_jacobian.numerics.checks import (
     number,
     positive,
     positive_or_infinite,
+    short,
 )
-from diffdrive_jacobian.numerics.fields import Checked, instance, short
 from diffdrive_jacobian.simulation.speeds import Piece, Profile, Twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -74,7 +74,6 @@ class AxisLimits(Checked):
 
 
 _NO_LIMITS = AxisLimits()
-_Axis = Annotated[AxisLimits, partial(instance, wanted=AxisLimits)]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -85,8 +84,8 @@ class AccelerationLimits(Checked):
         ValueError: A field is of another class, or the limit of the wheels is not positive.
     """
 
-    v: _Axis = _NO_LIMITS
-    omega: _Axis = _NO_LIMITS
+    v: AxisLimits = _NO_LIMITS
+    omega: AxisLimits = _NO_LIMITS
     max_wheel_acceleration: PositiveOrInfinite = math.inf
     """Largest angular acceleration of either wheel (rad/s^2)."""
 
@@ -196,9 +195,7 @@ class Actuators(Checked):
     """Largest speed of the left wheel (rad/s)."""
     lag: Annotated[float, _lag] = 0.0
     """Time constant tau of both wheels (s): 0 or at least `SHORTEST`."""
-    acceleration: Annotated[AccelerationLimits, partial(instance, wanted=AccelerationLimits)] = field(
-        default_factory=AccelerationLimits
-    )
+    acceleration: AccelerationLimits = field(default_factory=AccelerationLimits)
     """Limits of the acceleration."""
     delay: Duration = 0
     """Time from a command to its effect on the motors (ns)."""

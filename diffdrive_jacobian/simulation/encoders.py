@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from diffdrive_jacobian.numerics.fields import integer
+from diffdrive_jacobian.numerics.checks import integer
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.simulation.speeds import arc_end
 from diffdrive_jacobian.time_units import NANOSECONDS

@@ -20,8 +20,16 @@ from diffdrive_jacobian.control import Arrival, Controller
 from diffdrive_jacobian.control.controller import KP, Gain
 from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
-from diffdrive_jacobian.numerics.checks import Positive, array
-from diffdrive_jacobian.numerics.fields import Checked, Count, choices, instance, integer, short
+from diffdrive_jacobian.numerics.checks import (
+    Checked,
+    Count,
+    Positive,
+    array,
+    choices,
+    instance,
+    integer,
+    short,
+)
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
 from diffdrive_jacobian.simulation._block import LOST, Outcomes
 

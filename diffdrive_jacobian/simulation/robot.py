@@ -25,13 +25,13 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.kinematics.se2 import compose
 from diffdrive_jacobian.numerics.checks import (
     MAX_NANOSECONDS,
+    instance,
     nanoseconds,
     number,
     numbers,
     positive,
     read_only,
 )
-from diffdrive_jacobian.numerics.fields import instance
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty, moments_along
 from diffdrive_jacobian.simulation.actuators import STANDSTILL as STANDSTILL
 from diffdrive_jacobian.simulation.actuators import Drive, Speeds

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Annotated, Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
-from diffdrive_jacobian.numerics.checks import NotNegative, Positive, numbers
-from diffdrive_jacobian.numerics.fields import Checked, instance, optional
+from diffdrive_jacobian.numerics.checks import (
+    Checked,
+    NotNegative,
+    Positive,
+    instance,
+    numbers,
+)
 from diffdrive_jacobian.simulation.actuators import Actuators, Duration, Speeds
 from diffdrive_jacobian.simulation.odometry_noise import spectral_densities
 from diffdrive_jacobian.simulation.slip import Drift
@@ -59,9 +63,9 @@ class RobotModel(Checked):
     """Time after which the last command is replaced by zero (ns); 0: never."""
     wheel_travel_variance: NotNegative = 1e-5
     """k, variance of each wheel's travel per distance travelled (m)."""
-    drift: Annotated[Drift | None, optional(partial(instance, wanted=Drift))] = None
+    drift: Drift | None = None
     """In what the true motion differs from the odometry; None: in nothing."""
-    actuators: Annotated[Actuators | None, optional(partial(instance, wanted=Actuators))] = None
+    actuators: Actuators | None = None
     """In what the wheel motors differ from ideal ones; None: in nothing."""
 
     def limited(self, command: ArrayLike) -> tuple[float, float]:

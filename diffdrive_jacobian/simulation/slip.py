@@ -24,8 +24,7 @@ from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
-from diffdrive_jacobian.numerics.checks import Positive
-from diffdrive_jacobian.numerics.fields import Checked, integer, optional
+from diffdrive_jacobian.numerics.checks import Checked, Positive, integer, optional
 from diffdrive_jacobian.simulation.speeds import Piece, Profile, arc_end, moved, rolled
 from diffdrive_jacobian.time_units import NANOSECONDS
 

@@ -26,8 +26,15 @@ from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
 from diffdrive_jacobian.kinematics.inverse_kinematics import pose_difference
 from diffdrive_jacobian.kinematics.inverse_velocity import damping as damping_factor
 from diffdrive_jacobian.kinematics.inverse_velocity import manipulability
-from diffdrive_jacobian.numerics.checks import array, leading, not_negative, number, positive
-from diffdrive_jacobian.numerics.fields import instance, short
+from diffdrive_jacobian.numerics.checks import (
+    array,
+    instance,
+    leading,
+    not_negative,
+    number,
+    positive,
+    short,
+)
 from diffdrive_jacobian.numerics.formula import Array
 from diffdrive_jacobian.simulation.robot import STANDSTILL, Robot, RobotModel
 from diffdrive_jacobian.time_units import NANOSECONDS

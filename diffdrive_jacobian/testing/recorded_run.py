@@ -35,7 +35,7 @@ from diffdrive_jacobian.messages.structure import (
     walk,
 )
 from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TRANSFORMS, Selection
-from diffdrive_jacobian.numerics.fields import between
+from diffdrive_jacobian.numerics.checks import between
 from diffdrive_jacobian.plots.run_figure import draw
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording, RecordingError

@@ -13,7 +13,7 @@ from diffdrive_jacobian.exploration.trial import MessageDigest
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._report import brief
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.numerics.fields import integer
+from diffdrive_jacobian.numerics.checks import integer
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 from diffdrive_jacobian import __version__
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_POSITION
-from diffdrive_jacobian.numerics import fields
-from diffdrive_jacobian.numerics.fields import Check, between, finite, inside, integer, one_of
+from diffdrive_jacobian.numerics import checks
+from diffdrive_jacobian.numerics.checks import Check, between, finite, inside, integer, one_of
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, specifications
 from diffdrive_jacobian.parameters.file import configurations
 from diffdrive_jacobian.tools._output import note
@@ -105,9 +105,9 @@ angle = number_that(_in_radians)
 """Parses an angle (rad)."""
 coordinate = number_that(between(-MAX_POSITION, MAX_POSITION, unit='m'))
 """Parses a coordinate of a goal (m)."""
-positive = number_that(fields.positive)
+positive = number_that(checks.positive)
 """Parses a positive finite number."""
-not_negative = number_that(fields.not_negative)
+not_negative = number_that(checks.not_negative)
 """Parses a finite number that is zero or positive."""
 
 

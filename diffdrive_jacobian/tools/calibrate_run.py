@@ -19,7 +19,7 @@ from diffdrive_jacobian.calibration.description import (
     parameter_file,
 )
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.numerics.fields import between
+from diffdrive_jacobian.numerics.checks import between
 from diffdrive_jacobian.plots.calibration_figure import draw
 from diffdrive_jacobian.plots.output_files import create, new_file
 from diffdrive_jacobian.signals import Signals

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from diffdrive_jacobian import plots
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.numerics.fields import short
+from diffdrive_jacobian.numerics.checks import short
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, new_file
 from diffdrive_jacobian.plots.rendering import render, styled
 from diffdrive_jacobian.signals import Signals

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.numerics.fields import between
+from diffdrive_jacobian.numerics.checks import between
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _output
 from diffdrive_jacobian.tools.entry_points import DONE, FAILED, long_lived

@@ -62,7 +62,7 @@ def test_commands_are_parsed():
         ({'do': 'shutdown'}, "do must be one of .*, got 'shutdown'"),
         ({**DRIVE, 'more': 1}, 'drive must have the keys robot, v, omega'),
         ({**DRIVE, 'v': True}, 'v must be a number'),
-        ({**DRIVE, 'v': 10**400}, r'v must be in \[-1000, 1000\], got 1000000'),
+        ({**DRIVE, 'v': 10**400}, 'v must be finite, got 1000000'),
         ({**DRIVE, 'v': math.nan}, 'must be JSON'),
         (json.dumps(DRIVE).replace('0.2', '1e999'), r'v must be in \[-1000, 1000\], got inf'),
         ({**DRIVE, 'robot': 7}, 'robot must be a text'),
