@@ -36,21 +36,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, NamedTuple
+from functools import cached_property, partial
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics.singular_values import EPS, column, dot, outer, svd, times
 from diffdrive_jacobian.numerics.checks import (
+    Checked,
+    Count,
+    NotNegative,
+    Positive,
     array,
     floats,
     integer,
     leading,
     not_negative,
-    number,
-    positive,
+    one_of,
 )
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.numerics.formula import Entries, Vector, entries_first, formula
@@ -199,17 +202,11 @@ def solve(
     target, q0 = array('target', target, 'm'), array('q0', q0, 'n')
     (m,), (n,) = target.shape[-1:], q0.shape[-1:]
     batch = leading(target=target.shape[:-1], q0=q0.shape[:-1])
-    if method not in METHODS:
-        raise ValueError(f'method must be one of {", ".join(METHODS)}, got {method!r}')
-    if alpha is not None:
-        if method != 'transpose':
-            raise ValueError(f'alpha is for the method transpose alone, got method {method!r}')
-        alpha = number('alpha', alpha, positive)
-    integer('max_iterations', max_iterations, 1)
-    integer('restarts', restarts, 0)
-    if seed is not None and not isinstance(seed, np.random.Generator):
-        integer('seed', seed, 0)
-    weights = _weights(mask, m)
+    weights = np.ones(m) if mask is None else not_negative('mask', floats('mask', mask))
+    if weights.shape != (m,):
+        raise ValueError(f'mask must have shape ({m},), as target has m = {m}, got {weights.shape}')
+    if not weights.any():
+        raise ValueError(f'mask must have an entry that is not zero, got {weights.tolist()}')
     task = Task(
         forward=forward,
         jacobian=jacobian,
@@ -224,30 +221,21 @@ def solve(
         task=task,
         method=method,
         joints=n,
-        tolerance=number('tolerance', tolerance, positive),
-        step_tolerance=number('step_tolerance', step_tolerance, not_negative),
-        damping=number('damping', damping, positive),
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        step_tolerance=step_tolerance,
+        damping=damping,
         alpha=alpha,
-        restarts=int(restarts),
+        restarts=restarts,
         seed=seed,
     )
     # Of the caller's functions, too: what they return is checked.
     with np.errstate(all='ignore'):
-        found = search.run(np.broadcast_to(q0, (*batch, n)).reshape(-1, n), int(max_iterations))
+        found = search.run(np.broadcast_to(q0, (*batch, n)).reshape(-1, n))
         converged = found.error <= search.tolerance
     fields = (found.q.T, converged, found.iterations, found.error, found.restarts, found.start)
     # [()] converts the result of a single target to a scalar.
     return IKResult._make(values.reshape((*batch, *values.shape[1:]))[()] for values in fields)
-
-
-def _weights(mask: ArrayLike | None, m: int) -> Floats:
-    weights = np.ones(m) if mask is None else floats('mask', mask)
-    if weights.shape != (m,):
-        raise ValueError(f'mask must have shape ({m},), as target has m = {m}, got {weights.shape}')
-    not_negative('mask', weights)
-    if not weights.any():
-        raise ValueError(f'mask must have an entry that is not zero, got {weights.tolist()}')
-    return weights
 
 
 def joint_limits(limits: tuple[ArrayLike, ArrayLike], n: int) -> tuple[Floats, Floats]:
@@ -447,22 +435,35 @@ def best_alpha(J: Floats, JT_e: Floats) -> Floats:
     return np.asarray((norm(JT_e) / norm(times(J, JT_e))) ** 2)
 
 
-@dataclass
-class Search:
-    """How a task is searched for."""
+def _seed(name: str, value: Any) -> Any:
+    if value is None or isinstance(value, np.random.Generator):
+        return value
+    return integer(name, value, 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search(Checked):
+    """How a task is searched for, with the arguments of `solve`."""
 
     task: Task
-    method: str
+    method: Annotated[str, one_of(*METHODS)]
     joints: int
-    tolerance: float
-    step_tolerance: float
-    damping: float
-    alpha: float | None
-    restarts: int
-    seed: int | np.random.Generator | None
+    tolerance: Positive
+    max_iterations: Count
+    step_tolerance: NotNegative
+    damping: Positive
+    alpha: Positive | None
+    restarts: Annotated[int, partial(integer, low=0)]
+    seed: Annotated[Any, _seed]
 
-    def run(self, q: Floats, max_iterations: int) -> Outcome:
-        """Search from q, shape (k, n), and from restart points, in max_iterations steps per target."""
+    def __post_init__(self) -> None:
+        """Check every value."""
+        super().__post_init__()
+        if self.alpha is not None and self.method != 'transpose':
+            raise ValueError(f'alpha is for the method transpose alone, got method {self.method!r}')
+
+    def run(self, q: Floats) -> Outcome:
+        """Search from q, shape (k, n), and from restart points."""
         q, which = self.task.within_limits(q), np.arange(len(q))
         missing, e, error = self.task.errors(q, which)
         q, missing = entries_first(q, 1, 1), entries_first(missing, 1, 1)
@@ -473,7 +474,7 @@ class Search:
         still = still.keep(np.isfinite(error) & (error > self.tolerance))
         ended: Flags = np.zeros(len(still.which), dtype=np.bool_)
         self._differentiate(still, ~ended)
-        for _ in range(max_iterations):
+        for _ in range(self.max_iterations):
             J, JT_e = self._free(still)
             # Joint by joint, so that their units do not matter.
             most = STATIONARY[self.method] * np.sqrt(np.einsum('mnk,mnk->nk', J, J)) * still.error

@@ -82,12 +82,26 @@ class MobileManipulator(Checked):
     mount: Annotated[Any, _mount] = (0.0, 0.0)
     """Position of the arm's base in the frame of the axle centre, `[m_x, m_y]` (m)."""
 
-    def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
+    @property
+    def coordinates(self) -> int:
+        """Number of coordinates of the configuration, 3 + n."""
+        return 3 + self.arm.joints
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs, 2 + n."""
+        return 2 + self.arm.joints
+
+    @formula('(coordinates) -> (3)')
+    def forward_kinematics(self, q: Vector) -> Entries:
         """Return the pose of the tip in the world.
 
         For q, shape (..., 3 + n), it is `[x, y, heading]`, shape (..., 3) (m, m, rad).
         """
-        return _forward_kinematics(self._checked(q), self.arm.lengths, self.mount)
+        x, y, heading = arm_forward_kinematics.formula(self.arm.lengths, q[3:])
+        tip = [self.mount[0] + x, self.mount[1] + y, heading]
+        pose: Entries = se2.compose.formula(q[:3], tip)
+        return pose
 
     def jacobian(self, q: ArrayLike, heading: bool = False) -> NDArray[np.float64]:
         """Map the velocities of wheels and joints to that of the tip.
@@ -97,7 +111,7 @@ class MobileManipulator(Checked):
         (..., 3 + n), it has the shape (..., 2, 2 + n), or with the heading of the tip (..., 3, 2 + n),
         over `[omega_R, omega_L, q_1_dot, ...]`.
         """
-        q = self._checked(q)
+        q = array('q', q, self.coordinates)
         J = mobile_manipulator_jacobian(
             self.arm.lengths, q[..., 2], q[..., 3:], self.mount, self.r, self.L
         )
@@ -110,35 +124,19 @@ class MobileManipulator(Checked):
         joints. The gradient of a function of q becomes one over the inputs by `G^T gradient`: with it,
         secondary tasks such as `manipulability_gradient(robot.jacobian, q)` fit `redundant` (A, 3.2.5).
         """
-        theta = self._checked(q)[..., 2]
-        G = np.zeros((*theta.shape, 3 + self.arm.joints, 2 + self.arm.joints))
+        theta = array('q', q, self.coordinates)[..., 2]
+        G = np.zeros((*theta.shape, self.coordinates, self.inputs))
         G[..., :3, :2] = wheel_to_world_jacobian(theta, self.r, self.L)
         G[..., 3:, 2:] = np.eye(self.arm.joints)
         return G
 
-    def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
+    @formula('(coordinates),(inputs),() -> (coordinates)')
+    def integrate(self, q: Vector, q_dot: Vector, dt: Number) -> Entries:
         """Return the configuration after a time at constant input. The base follows an exact arc.
 
         For q, shape (..., 3 + n), inputs q_dot, shape (..., 2 + n) (rad/s), and durations, shape (...)
         (s), it has the shape (..., 3 + n), theta wrapped.
         """
-        q_dot = array('q_dot', q_dot, 2 + self.arm.joints)
-        return _integrate(self._checked(q), q_dot, dt, self.r, self.L)
-
-    def _checked(self, q: ArrayLike) -> NDArray[np.float64]:
-        return array('q', q, 3 + self.arm.joints)
-
-
-@formula('(k),(n),(2) -> (3)')
-def _forward_kinematics(q: Vector, lengths: Vector, mount: Vector) -> Entries:
-    x, y, heading = arm_forward_kinematics.formula(lengths, q[3:])
-    tip = [mount[0] + x, mount[1] + y, heading]
-    pose: Entries = se2.compose.formula(q[:3], tip)
-    return pose
-
-
-@formula('(k),(m),(),(),() -> (k)')
-def _integrate(q: Vector, q_dot: Vector, dt: Number, r: Number, L: Number) -> Entries:
-    twist = wheel_to_body.formula(q_dot[0], q_dot[1], r, L)
-    joints = [q_i + q_dot_i * dt for q_i, q_dot_i in zip(q[3:], q_dot[2:], strict=True)]
-    return [*se2.integrate.formula(q[:3], twist, dt), *joints]
+        twist = wheel_to_body.formula(q_dot[0], q_dot[1], self.r, self.L)
+        joints = [q_i + q_dot_i * dt for q_i, q_dot_i in zip(q[3:], q_dot[2:], strict=True)]
+        return [*se2.integrate.formula(q[:3], twist, dt), *joints]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics.singular_values import EPS, refuse_singular
-from diffdrive_jacobian.numerics.checks import array, positive
+from diffdrive_jacobian.numerics.checks import array, finite, positive, read_only
 from diffdrive_jacobian.numerics.elementary import (
     atan2,
     cos,
@@ -55,13 +55,11 @@ def arm_jacobian(lengths: Vector, q: Vector) -> Rows:
     ]
 
 
-@formula('(n),(n),(2) -> (n)')
-def arm_up_to_nearest_point(lengths: Vector, q: Vector, obstacle: Vector) -> Entries:
+def up_to_nearest_point(lengths: Vector, q: Vector, obstacle: Vector) -> Entries:
     """Return the lengths of the links of an arm that ends at its nearest point to an obstacle.
 
     The link with that point is shortened, the links beyond it have the length 0. So the forward
-    kinematics and the Jacobian of this arm are those of the nearest point. The obstacle is a point in
-    the frame of the arm, shape (..., 2) (m).
+    kinematics and the Jacobian of this arm are those of the nearest point. Arguments are not checked.
     """
     x, y = arm_links(lengths, q)
     nearest: Entries = list(lengths)
@@ -85,6 +83,11 @@ def arm_links(lengths: Vector, q: Vector) -> tuple[list[Number], list[Number]]:
     return x, y
 
 
+def _force_or_wrench(name: str, value: NDArray[np.float64]) -> None:
+    if finite(name, value).shape[-1] not in (2, 3):
+        raise ValueError(f'{name} must have shape (..., 2) or (..., 3), got {value.shape}')
+
+
 @dataclass(frozen=True, eq=False)
 class PlanarArm:
     """Links in a chain, each joint turning about the z axis.
@@ -99,24 +102,30 @@ class PlanarArm:
 
     def __init__(self, lengths: ArrayLike) -> None:
         """Take the lengths of the links, shape (n,), n >= 1 (m)."""
-        checked = array('lengths', lengths, 'n').copy()
+        checked = positive('lengths', array('lengths', lengths, 'n'))
         if checked.ndim != 1:
             raise ValueError(f'lengths must have shape (n,), got {checked.shape}')
-        positive('lengths', checked)
-        checked.flags.writeable = False
-        object.__setattr__(self, 'lengths', checked)
+        object.__setattr__(self, 'lengths', read_only(checked))
 
     @property
     def joints(self) -> int:
         """Number of joints, n."""
         return len(self.lengths)
 
-    def joint_positions(self, q: ArrayLike) -> NDArray[np.float64]:
+    @property
+    def _two_links(self) -> int:
+        if self.joints != 2:
+            raise ValueError(f'this is for an arm of 2 links, the arm has {self.joints}')
+        return 2
+
+    @formula('(joints) -> (k,2)')
+    def joint_positions(self, q: Vector) -> Rows:
         """Return the positions of the base, of every further joint and of the tip.
 
         The result has the shape (..., n + 1, 2) (m). The first is the base, [0, 0].
         """
-        return _joint_positions(self.lengths, q)
+        x, y = arm_links(self.lengths, q)
+        return [[sum(x[:joint], 0.0), sum(y[:joint], 0.0)] for joint in range(len(q) + 1)]
 
     def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the pose of the tip (A, D): `x = sum l_i cos(q_1 + ... + q_i)`, y with the sine.
@@ -137,13 +146,14 @@ class PlanarArm:
             return J
         return np.concatenate([J, np.ones_like(J[..., :1, :])], axis=-2)
 
-    def determinant(self, q: ArrayLike) -> NDArray[np.float64]:
+    @formula('(_two_links) -> ()')
+    def determinant(self, q: Vector) -> Number:
         """Return the determinant of the Jacobian of two links: `l1 l2 sin(q_2)` (A).
 
         The result has the shape (...) (m^2).
         """
-        self._need_two('determinant')
-        return np.asarray(_determinant(self.lengths, q))
+        l_1, l_2 = self.lengths
+        return l_1 * l_2 * sin(q[1])
 
     def singular_configurations(self, q_1: ArrayLike = 0.0) -> NDArray[np.float64]:
         """Return the configurations in which the position is singular: all links on one line (A, D).
@@ -172,8 +182,18 @@ class PlanarArm:
         stretched or folded. For a tip on the base, which any q_1 reaches, q_1 is 0. A position out of
         reach raises ValueError: its distance from the base must be from `|l_1 - l_2|` to `l_1 + l_2`.
         """
-        self._need_two('inverse_kinematics')
-        position = array('position', position, 2)
+        (l_1, l_2), (x, y) = self.lengths, np.moveaxis(self._reachable(position), -1, 0)
+        c_2 = (x * x + y * y - l_1 * l_1 - l_2 * l_2) / (2.0 * l_1 * l_2)
+        c_2 = maximum(minimum(c_2, 1.0), -1.0)  # only rounding is cut off
+        s_2 = sqrt(1.0 - c_2 * c_2)
+        bearing, inner = atan2(y, x), atan2(l_2 * s_2, l_1 + l_2 * c_2)
+        q_2 = atan2(s_2, c_2)
+        down, up = [wrap(bearing - inner), q_2], [wrap(bearing + inner), -q_2]
+        return np.stack([np.stack(down, axis=-1), np.stack(up, axis=-1)], axis=-2)
+
+    def _reachable(self, position: ArrayLike) -> NDArray[np.float64]:
+        """Require positions that the tip of two links can reach."""
+        position = array('position', position, self._two_links)
         distance = np.hypot(position[..., 0], position[..., 1])
         least, most = abs(self.lengths[0] - self.lengths[1]), self.lengths.sum()
         rounding = 4.0 * EPS * most
@@ -183,25 +203,36 @@ class PlanarArm:
                 f'position must be from {least:g} to {most:g} m away from the base, '
                 f'got {position[beyond][0].tolist()}'
             )
-        return _inverse_kinematics(self.lengths, position)
+        return position
 
-    def inverse_velocity(self, q: ArrayLike, x_dot: ArrayLike) -> NDArray[np.float64]:
+    @formula('(_two_links),(2) -> (2)')
+    def inverse_velocity(self, q: Vector, x_dot: Vector) -> Entries:
         """Return joint velocities of two links for a velocity of the tip, by the adjugate (A, 3.2.1).
 
         For velocities of the tip, shape (..., 2) (m/s), the result has the shape (..., 2) (rad/s). A
         configuration that is singular to working precision raises LinAlgError.
         """
-        self._need_two('inverse_velocity')
-        return _inverse_velocity(self.lengths, q, x_dot)
+        (a, b), (c, d) = arm_jacobian.formula(self.lengths, q)
+        l_1, l_2 = self.lengths
+        determinant = l_1 * l_2 * sin(q[1])
+        # More accurate than from the entries of J: only the rounding of q_2 itself remains.
+        blur = 4.0 * EPS * maximum(1.0, abs(q[1]))
+        refuse_singular(determinant, abs(determinant) <= blur * l_1 * l_2)
+        v_x, v_y = x_dot
+        return [(d * v_x - b * v_y) / determinant, (a * v_y - c * v_x) / determinant]
 
-    def clearance(self, q: ArrayLike, obstacle: ArrayLike) -> NDArray[np.float64]:
+    @formula('(joints),(2) -> ()')
+    def clearance(self, q: Vector, obstacle: Vector) -> Number:
         """Return the distance of the arm from an obstacle, a point, to the nearest point of its links.
 
         Obstacles have the shape (..., 2), the result (...) (m).
         """
-        return np.asarray(_clearance(self.lengths, q, obstacle))
+        nearest = up_to_nearest_point(self.lengths, q, obstacle)
+        x, y, _ = arm_forward_kinematics.formula(nearest, q)
+        return hypot(x - obstacle[0], y - obstacle[1])
 
-    def clearance_gradient(self, q: ArrayLike, obstacle: ArrayLike) -> NDArray[np.float64]:
+    @formula('(joints),(2) -> (joints)')
+    def clearance_gradient(self, q: Vector, obstacle: Vector) -> Entries:
         """Return the gradient of `clearance`: a motion away from an obstacle (A, 3.2.5).
 
         It is `J^T n`, with the Jacobian J of the nearest point and the unit vector n from the obstacle
@@ -212,97 +243,31 @@ class PlanarArm:
         Source: A. A. Maciejewski, C. A. Klein, "Obstacle avoidance for kinematically redundant
         manipulators in dynamically varying environments", 1985.
         """
-        return _clearance_gradient(self.lengths, q, obstacle)
+        nearest = up_to_nearest_point(self.lengths, q, obstacle)
+        x, y, _ = arm_forward_kinematics.formula(nearest, q)
+        J_x, J_y = arm_jacobian.formula(nearest, q)
+        away_x, away_y = x - obstacle[0], y - obstacle[1]
+        distance = hypot(away_x, away_y)
+        distance = where(distance > 0.0, distance, 1.0)
+        return [(J_xi * away_x + J_yi * away_y) / distance for J_xi, J_yi in zip(J_x, J_y, strict=True)]
 
-    def joint_torques(self, q: ArrayLike, wrench: ArrayLike) -> NDArray[np.float64]:
+    @formula('(joints),(m) -> (joints)', wrench=_force_or_wrench)
+    def joint_torques(self, q: Vector, wrench: Vector) -> Entries:
         """Return the joint torques of a wrench at the tip: `tau = J^T W` (D, 6).
 
         The wrench is a force `[f_x, f_y]` (N), or with the moment `[f_x, f_y, m_z]` (N, N, N m), shape
         (..., 2) or (..., 3). The result has the shape (..., n) (N m).
         """
-        wrench = array('wrench', wrench, 'm')
-        if wrench.shape[-1] not in (2, 3):
-            raise ValueError(f'wrench must have shape (..., 2) or (..., 3), got {wrench.shape}')
-        return _joint_torques(self.lengths, q, wrench)
+        J_x, J_y = arm_jacobian.formula(self.lengths, q)
+        # A moment acts on every joint alike.
+        f_x, f_y, m_z = [*wrench, 0.0][:3]
+        return [J_xi * f_x + J_yi * f_y + m_z for J_xi, J_yi in zip(J_x, J_y, strict=True)]
 
-    def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
+    @formula('(joints),(joints),() -> (joints)')
+    def integrate(self, q: Vector, q_dot: Vector, dt: Number) -> Entries:
         """Return the joint angles after a time at constant velocity: `q + q_dot dt` (D, 4.1).
 
         For joint velocities, shape (..., n) (rad/s), and durations, shape (...) (s), the result has the
         shape (..., n) (rad). The angles are not wrapped.
         """
-        q = array('q', q, self.joints)
-        return integrate_joints(q, q_dot, dt)
-
-    def _need_two(self, what: str) -> None:
-        if self.joints != 2:
-            raise ValueError(f'{what} is for an arm of 2 links, this one has {self.joints}')
-
-
-@formula('(n),(n) -> (j,2)')
-def _joint_positions(lengths: Vector, q: Vector) -> Rows:
-    x, y = arm_links(lengths, q)
-    return [[sum(x[:joint], 0.0), sum(y[:joint], 0.0)] for joint in range(len(q) + 1)]
-
-
-@formula('(2),(2) -> ()')
-def _determinant(lengths: Vector, q: Vector) -> Number:
-    (l_1, l_2), (_, q_2) = lengths, q
-    return l_1 * l_2 * sin(q_2)
-
-
-@formula('(2),(2) -> (2,2)')
-def _inverse_kinematics(lengths: Vector, position: Vector) -> Rows:
-    (l_1, l_2), (x, y) = lengths, position
-    c_2 = (x * x + y * y - l_1 * l_1 - l_2 * l_2) / (2.0 * l_1 * l_2)
-    c_2 = maximum(minimum(c_2, 1.0), -1.0)  # only rounding is cut off
-    s_2 = sqrt(1.0 - c_2 * c_2)
-    bearing, inner = atan2(y, x), atan2(l_2 * s_2, l_1 + l_2 * c_2)
-    q_2 = atan2(s_2, c_2)
-    return [
-        [wrap(bearing - inner), q_2],
-        [wrap(bearing + inner), -q_2],
-    ]
-
-
-@formula('(2),(2),(2) -> (2)')
-def _inverse_velocity(lengths: Vector, q: Vector, x_dot: Vector) -> Entries:
-    (a, b), (c, d) = arm_jacobian.formula(lengths, q)
-    determinant = _determinant.formula(lengths, q)
-    # More accurate than from the entries of J: only the rounding of q_2 itself remains.
-    blur = 4.0 * EPS * maximum(1.0, abs(q[1]))
-    refuse_singular(determinant, abs(determinant) <= blur * lengths[0] * lengths[1])
-    v_x, v_y = x_dot
-    return [(d * v_x - b * v_y) / determinant, (a * v_y - c * v_x) / determinant]
-
-
-@formula('(n),(n),(2) -> ()')
-def _clearance(lengths: Vector, q: Vector, obstacle: Vector) -> Number:
-    nearest = arm_up_to_nearest_point.formula(lengths, q, obstacle)
-    x, y, _ = arm_forward_kinematics.formula(nearest, q)
-    return hypot(x - obstacle[0], y - obstacle[1])
-
-
-@formula('(n),(n),(2) -> (n)')
-def _clearance_gradient(lengths: Vector, q: Vector, obstacle: Vector) -> Entries:
-    nearest = arm_up_to_nearest_point.formula(lengths, q, obstacle)
-    x, y, _ = arm_forward_kinematics.formula(nearest, q)
-    J_x, J_y = arm_jacobian.formula(nearest, q)
-    away_x, away_y = x - obstacle[0], y - obstacle[1]
-    distance = hypot(away_x, away_y)
-    distance = where(distance > 0.0, distance, 1.0)
-    return [(J_xi * away_x + J_yi * away_y) / distance for J_xi, J_yi in zip(J_x, J_y, strict=True)]
-
-
-@formula('(n),(n),(m) -> (n)')
-def _joint_torques(lengths: Vector, q: Vector, wrench: Vector) -> Entries:
-    J_x, J_y = arm_jacobian.formula(lengths, q)
-    # A moment acts on every joint alike.
-    f_x, f_y, m_z = [*wrench, 0.0][:3]
-    return [J_xi * f_x + J_yi * f_y + m_z for J_xi, J_yi in zip(J_x, J_y, strict=True)]
-
-
-@formula('(n),(n),() -> (n)')
-def integrate_joints(q: Vector, q_dot: Vector, dt: Number) -> Entries:
-    """Return `q + q_dot dt`."""
-    return [q_i + q_dot_i * dt for q_i, q_dot_i in zip(q, q_dot, strict=True)]
+        return [q_i + q_dot_i * dt for q_i, q_dot_i in zip(q, q_dot, strict=True)]

@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics.inverse_kinematics import IKResult, joint_limits, solve
-from diffdrive_jacobian.kinematics.planar_arm import integrate_joints
 from diffdrive_jacobian.kinematics.spatial import (
     pose_vector,
     pose_vector_difference,
@@ -37,7 +36,7 @@ from diffdrive_jacobian.kinematics.spatial import (
     spatial_displacement_jacobian,
 )
 from diffdrive_jacobian.numerics.checks import array, finite, floats, integer, one_of
-from diffdrive_jacobian.numerics.elementary import cos, product, sin
+from diffdrive_jacobian.numerics.elementary import cos, dot, product, sin
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 __all__ = ['IIWA', 'PANDA', 'UR5', 'SpatialArm']
@@ -59,70 +58,6 @@ def link(a: Number, alpha: Number, d: Number, theta: Number) -> tuple[Rows, Entr
         [0.0, s_a, c_a],
     ]
     return R, [a * c, a * s, d]
-
-
-def link_frames(
-    a: Vector, alpha: Vector, d: Vector, theta: Vector, slides: Vector, q: Vector
-) -> list[tuple[Rows, Entries]]:
-    """Return rotation and position of the base and of each link's frame, n + 1 of them, unchecked.
-
-    A joint i with slides_i = 1 is prismatic, one with 0 revolute.
-    """
-    R, p = IDENTITY, [0.0, 0.0, 0.0]
-    frames = [(R, p)]
-    for a_i, alpha_i, d_i, theta_i, s_i, q_i in zip(a, alpha, d, theta, slides, q, strict=True):
-        R_i, p_i = link(a_i, alpha_i, d_i + s_i * q_i, theta_i + (1.0 - s_i) * q_i)
-        p = [p_k + sum(map(_times, row, p_i)) for p_k, row in zip(p, R, strict=True)]
-        R = product(R, R_i)
-        frames.append((R, p))
-    return frames
-
-
-def _times(x: Number, y: Number) -> Number:
-    return x * y
-
-
-@formula('(n),(n),(n),(n),(n),(n) -> (4,4)')
-def _forward_kinematics(
-    a: Vector, alpha: Vector, d: Vector, theta: Vector, slides: Vector, q: Vector
-) -> Rows:
-    R, p = link_frames(a, alpha, d, theta, slides, q)[-1]
-    return [[*row, p_k] for row, p_k in zip(R, p, strict=True)] + [[0.0, 0.0, 0.0, 1.0]]
-
-
-@formula('(n),(n),(n),(n),(n),(n) -> (j,3)')
-def _joint_positions(
-    a: Vector, alpha: Vector, d: Vector, theta: Vector, slides: Vector, q: Vector
-) -> Rows:
-    return [p for _, p in link_frames(a, alpha, d, theta, slides, q)]
-
-
-@formula('(n),(n),(n),(n),(n),(n) -> (6,n)')
-def _jacobian(a: Vector, alpha: Vector, d: Vector, theta: Vector, slides: Vector, q: Vector) -> Rows:
-    frames = link_frames(a, alpha, d, theta, slides, q)
-    _, p_E = frames[-1]
-    columns = []
-    for (R, p), s_i in zip(frames, slides, strict=False):
-        # The axis of the joint, and from it to the end effector.
-        z_x, z_y, z_z = (row[2] for row in R)
-        r_x, r_y, r_z = (e - k for e, k in zip(p_E, p, strict=True))
-        across = [z_y * r_z - z_z * r_y, z_z * r_x - z_x * r_z, z_x * r_y - z_y * r_x]  # z x r
-        z = [z_x, z_y, z_z]
-        columns.append(
-            [
-                *((1.0 - s_i) * turning + s_i * along for turning, along in zip(across, z, strict=True)),
-                *((1.0 - s_i) * axis for axis in z),
-            ]
-        )
-    return [list(row) for row in zip(*columns, strict=True)]
-
-
-@formula('(n),(n),(n),(n),(n),(n),(6) -> (n)')
-def _joint_torques(
-    a: Vector, alpha: Vector, d: Vector, theta: Vector, slides: Vector, q: Vector, wrench: Vector
-) -> Entries:
-    J = _jacobian.formula(a, alpha, d, theta, slides, q)
-    return [sum(map(_times, column, wrench)) for column in zip(*J, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,13 +112,28 @@ class SpatialArm:
         """Number of joints, n."""
         return len(self.a)
 
-    def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Return the pose of the end effector: `T(q) = T_1 ... T_n`, shape (..., 4, 4) (D)."""
-        return _forward_kinematics(self.a, self.alpha, self.d, self.theta, self.slides, q)
+    def _frames(self, q: Vector) -> list[tuple[Rows, Entries]]:
+        """Return rotation and position of the base and of each link's frame, unchecked."""
+        R, p = IDENTITY, [0.0, 0.0, 0.0]
+        frames = [(R, p)]
+        parameters = np.array([self.a, self.alpha, self.d, self.theta, self.slides]).T.tolist()
+        for (a, alpha, d, theta, slides), q_i in zip(parameters, q, strict=True):
+            R_i, p_i = link(a, alpha, d + slides * q_i, theta + (1.0 - slides) * q_i)
+            p = [p_k + dot(row, p_i) for p_k, row in zip(p, R, strict=True)]
+            R = product(R, R_i)
+            frames.append((R, p))
+        return frames
 
-    def joint_positions(self, q: ArrayLike) -> NDArray[np.float64]:
+    @formula('(joints) -> (4,4)')
+    def forward_kinematics(self, q: Vector) -> Rows:
+        """Return the pose of the end effector: `T(q) = T_1 ... T_n`, shape (..., 4, 4) (D)."""
+        R, p = self._frames(q)[-1]
+        return [[*row, p_k] for row, p_k in zip(R, p, strict=True)] + [[0.0, 0.0, 0.0, 1.0]]
+
+    @formula('(joints) -> (k,3)')
+    def joint_positions(self, q: Vector) -> Rows:
         """Return the origins of the base and of each link's frame, shape (..., n + 1, 3) (m)."""
-        return _joint_positions(self.a, self.alpha, self.d, self.theta, self.slides, q)
+        return [p for _, p in self._frames(q)]
 
     def jacobian(self, q: ArrayLike, frame: str = 'base') -> NDArray[np.float64]:
         """Map joint velocities to the velocity of the end effector: `nu = J(q) q_dot` (D, 2.1).
@@ -193,27 +143,46 @@ class SpatialArm:
         The result has the shape (..., 6, n).
         """
         one_of(*ERRORS)('frame', frame)
-        J = _jacobian(self.a, self.alpha, self.d, self.theta, self.slides, q)
+        J = self._jacobian(q)
         if frame == 'base':
             return J
         R_transposed = np.swapaxes(self.forward_kinematics(q)[..., :3, :3], -1, -2)
         return np.concatenate([R_transposed @ J[..., :3, :], R_transposed @ J[..., 3:, :]], axis=-2)
 
-    def joint_torques(self, q: ArrayLike, wrench: ArrayLike) -> NDArray[np.float64]:
+    def _columns(self, q: Vector) -> list[Entries]:
+        """Return the column of each joint, in the axes of the base, unchecked."""
+        frames = self._frames(q)
+        _, p_E = frames[-1]
+        columns = []
+        for (R, p), s_i in zip(frames, self.slides.tolist(), strict=False):
+            # The axis of the joint, and from it to the end effector.
+            z = z_x, z_y, z_z = [row[2] for row in R]
+            r_x, r_y, r_z = (e - k for e, k in zip(p_E, p, strict=True))
+            z_r = [z_y * r_z - z_z * r_y, z_z * r_x - z_x * r_z, z_x * r_y - z_y * r_x]  # z x r
+            columns.append([*z, 0.0, 0.0, 0.0] if s_i else [*z_r, *z])
+        return columns
+
+    @formula('(joints) -> (6,joints)')
+    def _jacobian(self, q: Vector) -> Rows:
+        return [list(row) for row in zip(*self._columns(q), strict=True)]
+
+    @formula('(joints),(6) -> (joints)')
+    def joint_torques(self, q: Vector, wrench: Vector) -> Entries:
         """Return the torques, or forces, of the joints for a wrench at E: `Q = J^T W` (D, 5).
 
         The wrench is `[f, m]` in the axes of the base, shape (..., 6) (N, N m). The result has the shape
         (..., n) (N m, or N where a joint slides).
         """
-        return _joint_torques(self.a, self.alpha, self.d, self.theta, self.slides, q, wrench)
+        return [dot(column, wrench) for column in self._columns(q)]
 
-    def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
+    @formula('(joints),(joints),() -> (joints)')
+    def integrate(self, q: Vector, q_dot: Vector, dt: Number) -> Entries:
         """Return the joints after a time at constant velocity: `q + q_dot dt` (D, 4.1).
 
         For joint velocities, shape (..., n), and durations, shape (...) (s), the result has the shape
         (..., n). Angles are not wrapped.
         """
-        return integrate_joints(array('q', q, self.joints), q_dot, dt)
+        return [q_i + q_dot_i * dt for q_i, q_dot_i in zip(q, q_dot, strict=True)]
 
     def inverse_kinematics(
         self, target: ArrayLike, q0: ArrayLike, frame: str = 'base', **options: Any

@@ -105,10 +105,15 @@ def all_finite(x: Any) -> bool:
     return math.isfinite(x) if type(x) is float else bool(np.isfinite(x).all())
 
 
+def dot(a: Iterable[Any], b: Iterable[Any]) -> Any:
+    """Multiply two vectors."""
+    return sum(map(mul, a, b))
+
+
 def product(A: Sequence[Sequence[Any]], B: Sequence[Sequence[Any]]) -> list[list[Any]]:
     """Multiply two matrices that are lists of rows."""
     columns = list(zip(*B, strict=True))
-    return [[sum(map(mul, row, column)) for column in columns] for row in A]
+    return [[dot(row, column) for column in columns] for row in A]
 
 
 # --- One robot, for every message
