@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.run import Run, Series, number
 from diffdrive_jacobian.control import Path
-from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import Fate, FollowedGoal, GoalFollower, GoalState, Stamp
 from diffdrive_jacobian.messages.topics import SENSORS
@@ -391,7 +391,7 @@ def _driven_offset(run: Run) -> float:
     Reading a bag must not import these.
     """
     name = run.of_node('go_to_goal').get('controller')
-    controller = BUILT_IN.get(name) if isinstance(name, str) else None
+    controller = CONTROLLERS.built_in.get(name) if isinstance(name, str) else None
     if controller is None or not controller.offset:
         return 0.0
     default = controller.driven_offset(controller.defaults)
@@ -400,7 +400,7 @@ def _driven_offset(run: Run) -> float:
 
 def heading_counts(parameters: Mapping[str, Any]) -> bool:
     """Return whether a controller with these parameters turns to the heading of its last goal."""
-    controller = BUILT_IN.get(str(parameters.get('controller')))
+    controller = CONTROLLERS.built_in.get(str(parameters.get('controller')))
     takes_heading = controller is not None and controller.takes_heading
     return parameters.get('use_goal_heading') is True or takes_heading
 

@@ -12,7 +12,6 @@ from diffdrive_jacobian.control.controller import (
 )
 from diffdrive_jacobian.control.controllers import (
     ControllerError,
-    Controllers,
     controller_names,
     find_controller,
     find_path_controller,
@@ -45,7 +44,6 @@ __all__ = [
     'Boundary',
     'Controller',
     'ControllerError',
-    'Controllers',
     'Gain',
     'LawError',
     'Path',

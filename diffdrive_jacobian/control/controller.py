@@ -37,6 +37,7 @@ from diffdrive_jacobian.numerics.checks import (
     between,
     function,
     instance,
+    number,
     numbers,
     optional,
     short,
@@ -302,9 +303,8 @@ class PathController(ControlLaw):
 class BoundLaw:
     """A law with its gains, for single poses, and what it remembers.
 
-    It is called with a pose, shape (3,), and a goal, shape (3,), or a reference, shape (8,), arrays or
-    tuples of floats, and returns `(v, omega)`. It raises LawError if the law fails or returns something
-    else.
+    It is called with a pose, shape (3,), and a goal, shape (3,), or a reference, shape (8,), and returns
+    `(v, omega)`. It raises LawError if the law fails or returns something else.
     """
 
     def __init__(self, controller: ControlLaw, values: tuple[float, ...], size: int) -> None:
@@ -312,11 +312,8 @@ class BoundLaw:
         self.controller = controller
         self._values = values
         self._size = size
-        # An equation is given floats that are checked already; another law may index arrays.
-        self._equation = getattr(controller.law, 'formula', None)
-        self._for_floats: Any = None
-        if self._equation is not None and not controller.state:
-            self._for_floats = controller.law
+        # An equation takes any numbers, which were checked before; another law may index arrays.
+        self._is_equation = hasattr(controller.law, 'floats')
         self.now = 0
         """Time of the next pose (ns). Needed by laws with a state."""
         self._before: int | None = None
@@ -333,60 +330,37 @@ class BoundLaw:
 
     def __call__(self, pose: Any, goal: Any) -> tuple[float, float]:
         """Return the twist."""
-        name, state = self.controller.name, self._state
+        controller, goal = self.controller, goal[: self._size]
+        more: dict[str, Any] = {}
+        if self._state:
+            # The clock may go back.
+            dt = 0.0 if self._before is None else max(0, self.now - self._before) / NANOSECONDS
+            more = {'state': np.array(self._state), 'dt': dt}
         try:
-            if self._for_floats is not None and type(goal) is tuple:
-                twist = self._for_floats.floats(pose, goal[: self._size], *self._values)
+            if self._is_equation:
+                found = controller.law.floats(pose, goal, *self._values, **more)  # type: ignore[attr-defined]
             else:
-                twist = self._evaluated(pose, goal)
+                found = controller.law(np.asarray(pose), np.asarray(goal), *self._values, **more)
         except Exception as error:
-            raise LawError(f'the law of controller {name!r} failed: {_reason(error)}') from error
-        try:
-            if state:
-                v, omega, state = twist
-                if np.shape(state) != (len(self._state),):
-                    raise ValueError(f'shape {np.shape(state)}')
-                state = tuple(map(float, state))
-            else:
-                v, omega = twist
-            if type(v) is type(omega) is float and isfinite(v) and isfinite(omega) and not state:
-                self._before = self.now
-                return v, omega
-            v, omega = _number(v), _number(omega)
-        except (TypeError, ValueError) as error:
             raise LawError(
-                f'the law of controller {name!r} must return (v, omega), two numbers'
-                + (f', and the state, shape ({len(self._state)},)' if self._state else '')
-                + f', got {short(twist)}'
+                f'the law of controller {controller.name!r} failed: {_reason(error)}'
             ) from error
-        if not (isfinite(v) and isfinite(omega) and all(map(isfinite, state))):
+        self._before = self.now
+        try:
+            if self._state:
+                v, omega, state = found
+                self._state = numbers('state', state, len(self._state))
+            else:
+                v, omega = found
+            if type(v) is type(omega) is float and isfinite(v) and isfinite(omega):
+                return v, omega
+            return number('v', v), number('omega', omega)
+        except (TypeError, ValueError) as error:
+            also = f', and the state, shape ({len(self._state)},)' if self._state else ''
             raise LawError(
-                f'the law of controller {name!r} must return finite (v, omega), got ({v:g}, {omega:g})'
-                + (f' and the state {short(list(state))}' if state else '')
-            )
-        self._before, self._state = self.now, state
-        return v, omega
-
-    def _evaluated(self, pose: Any, goal: Any) -> Any:
-        state: Any = list(self._state)
-        if self._equation is None:
-            law, at, to = self.controller.law, np.asarray(pose), np.asarray(goal[: self._size])
-            state = np.array(state)
-        else:
-            law, at, to = self._equation, pose, np.asarray(goal)[: self._size].tolist()
-        if not self._state:
-            return law(at, to, *self._values)
-        # The clock may go back.
-        dt = 0.0 if self._before is None else max(0, self.now - self._before) / NANOSECONDS
-        return law(at, to, *self._values, state=state, dt=dt)
-
-
-def _number(value: Any) -> float:
-    if type(value) is float:
-        return value
-    if np.shape(value) != ():
-        raise ValueError('an array')
-    return float(value)
+                f'the law of controller {controller.name!r} must return (v, omega), two finite '
+                f'numbers{also}, got {short(found)}'
+            ) from error
 
 
 def _reason(error: Exception) -> str:

@@ -10,14 +10,15 @@ An entry point is imported when its controller is used, not before.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
-from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
+import copy
+from collections.abc import Collection, Iterable, Iterator
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from diffdrive_jacobian.control.controller import ControlLaw, Controller, PathController
 from diffdrive_jacobian.control.goal_laws import GOAL_CONTROLLERS
 from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.numerics.checks import instance, short
+from diffdrive_jacobian.numerics.checks import choices, instance, short
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -29,77 +30,69 @@ class ControllerError(DiffdriveError, ValueError):
     """There is no such controller, or it cannot be loaded."""
 
 
-BUILT_IN = {one.name: one for one in GOAL_CONTROLLERS}
-"""The controllers of goals of this package, by name."""
+class Controllers(Collection[str], Generic[C]):
+    """Names of the controllers of one kind that can be used, and the controllers by name.
 
+    Iteration and `in` look for installed entry points, but do not import them.
+    """
 
-class AnyControllers(Collection[str], Generic[C]):
-    """Base class of `Controllers` and `PathControllers`."""
+    def __init__(self, kind: type[C], built_in: Iterable[C], parameter: str, title: str) -> None:
+        """Take the controllers of this package, the parameter of go_to_goal that chooses one, and what
+        they are, for its description.
+        """
+        self.kind = kind
+        self.built_in = {one.name: one for one in built_in}
+        self.parameter = parameter
+        self.title = title
+        self.group = f'diffdrive_jacobian.{parameter}s'
+        # Those that were given or imported, too.
+        self._known: dict[str, C] = dict(self.built_in)
 
-    kind: type[C]
-    """Their class."""
-    built_in: ClassVar[Mapping[str, ControlLaw]]
-    """The controllers of this package, by name."""
-    group: ClassVar[str]
-    """Entry-point group of the controllers of other packages."""
-    parameter: ClassVar[str]
-    """Parameter of go_to_goal that chooses one."""
-    title: ClassVar[str]
-    """What it is, in the description of the parameter."""
-
-    def __init__(self, *given: C) -> None:
-        """Take further controllers, which take precedence over installed ones of the same name.
+    def with_controller(self, controller: C) -> Controllers[C]:
+        """Return these and another one, which takes precedence over an installed one of the same name.
 
         One of another class, or with the name of a built-in one, raises ValueError.
         """
-        self._given: dict[str, C] = {}
-        for controller in given:
-            instance(self.parameter, controller, self.kind)
-            if self.built_in.get(controller.name, controller) != controller:
-                raise ValueError(
-                    f'{self.parameter} must have a name of its own, got {controller.name!r}, '
-                    'which is built in'
-                )
-            self._given[controller.name] = controller
+        instance(self.parameter, controller, self.kind)
+        if self.built_in.get(controller.name, controller) != controller:
+            raise ValueError(
+                f'{self.parameter} must have a name of its own, got {controller.name!r}, '
+                'which is built in'
+            )
+        more = copy.copy(self)
+        more._known = {**self._known, controller.name: controller}
+        return more
 
     def __contains__(self, name: object) -> bool:
         """Return whether there is a controller of that name, without loading it."""
-        if not isinstance(name, str):
-            return False
-        known = name in self.built_in or name in self._given or (self.group, name) in _loaded
-        return known or bool(self._entry_points(name))
+        return isinstance(name, str) and (name in self._known or bool(self._entry_points(name)))
 
     def __iter__(self) -> Iterator[str]:
         """Return the names, sorted."""
-        installed = (one.name for one in self._entry_points())
-        return iter(sorted({*self.built_in, *self._given, *installed}))
+        return iter(sorted({*self._known, *(one.name for one in self._entry_points())}))
 
     def __len__(self) -> int:
         """Return how many there are."""
-        return len(list(iter(self)))
+        return len(tuple(iter(self)))
 
     def __bool__(self) -> bool:
-        """Return True: there are always the built-in ones."""
+        """Return True, without a search: there are always the built-in ones."""
         return True
-
-    def hint(self, name: str) -> str:
-        """Return what a name is that is no controller of this kind. Empty: this is not known."""
-        return ''
 
     def find(self, name: str) -> C:
         """Return the controller of that name; an installed one is imported.
 
         A name that is unknown, and a controller that cannot be loaded, raise ControllerError.
         """
-        if isinstance(name, str) and (found := self._given.get(name) or self.built_in.get(name)):
-            assert isinstance(found, self.kind)
-            return found
         if name not in self:
+            others = [one for one in (CONTROLLERS, ALL_PATH_CONTROLLERS) if name in one]
+            hint = f', a law of {"goals" if others[0] is CONTROLLERS else "paths"}' if others else ''
             raise ControllerError(
-                f'{self.parameter} must be one of {", ".join(map(repr, self))}, got {short(repr(name))}'
-                f'{self.hint(name)}'
+                f'{self.parameter} must be {choices(self)}, got {short(name, repr)}{hint}'
             )
-        return self._load(name)
+        if name not in self._known:
+            self._known[name] = self._load(name)
+        return self._known[name]
 
     def _entry_points(self, name: str | None = None) -> list[EntryPoint]:
         """Return the installed entry points, all or those of one name."""
@@ -113,9 +106,6 @@ class AnyControllers(Collection[str], Generic[C]):
 
     def _load(self, name: str) -> C:
         """Import an installed controller."""
-        known = _loaded.get((self.group, name))
-        if isinstance(known, self.kind):
-            return known
         found = self._entry_points(name)
         owners = ' and '.join(sorted(_owner(one) for one in found))
         if len(found) > 1:
@@ -133,44 +123,20 @@ class AnyControllers(Collection[str], Generic[C]):
             raise ControllerError(
                 f'{what} must have the name of its entry point, {name!r}, got {controller.name!r}'
             )
-        _loaded[self.group, name] = controller
         return controller
 
 
-class Controllers(AnyControllers[Controller]):
-    """Names of the controllers of goals that can be used, and the controllers by name.
-
-    Iteration and `in` look for installed entry points, but do not import them.
-    """
-
-    kind = Controller
-    built_in = BUILT_IN
-    group = 'diffdrive_jacobian.controllers'
-    parameter = 'controller'
-    title = 'Control law'
-
-    def hint(self, name: str) -> str:
-        """Return what a name is that is no controller of goals."""
-        return ', a law of paths' if name in ALL_PATH_CONTROLLERS else ''
+def _owner(entry_point: EntryPoint) -> str:
+    """Return name and version of the package that provides an entry point."""
+    owner = entry_point.dist
+    return 'an unknown package' if owner is None else f'{owner.name} {owner.version}'
 
 
-class PathControllers(AnyControllers[PathController]):
-    """Names of the controllers of paths, as `Controllers` of those of goals."""
-
-    kind = PathController
-    built_in: ClassVar = {one.name: one for one in PATH_CONTROLLERS}
-    group = 'diffdrive_jacobian.path_controllers'
-    parameter = 'path_controller'
-    title = 'Control law along a path'
-
-    def hint(self, name: str) -> str:
-        """Return what a name is that is no controller of paths."""
-        return ', a law of goals' if name in CONTROLLERS else ''
-
-
-CONTROLLERS = Controllers()
+CONTROLLERS = Controllers(Controller, GOAL_CONTROLLERS, 'controller', 'Control law')
 """The built-in and the installed controllers of goals."""
-ALL_PATH_CONTROLLERS = PathControllers()
+ALL_PATH_CONTROLLERS = Controllers(
+    PathController, PATH_CONTROLLERS, 'path_controller', 'Control law along a path'
+)
 """The built-in and the installed controllers of paths."""
 
 
@@ -195,15 +161,3 @@ def find_path_controller(name: str) -> PathController:
 def path_controller_names() -> tuple[str, ...]:
     """Return the names of the built-in and the installed controllers of paths, sorted."""
     return tuple(ALL_PATH_CONTROLLERS)
-
-
-_loaded: dict[tuple[str, str], ControlLaw] = {}
-"""The installed controllers that were imported, by group and name."""
-
-
-def _owner(entry_point: EntryPoint) -> str:
-    """Return name and version of the package that provides an entry point."""
-    distribution = entry_point.dist
-    if distribution is None:
-        return 'an unknown package'
-    return f'{distribution.name} {distribution.version}'

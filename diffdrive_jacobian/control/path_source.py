@@ -13,16 +13,16 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.path import Path
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.numerics.checks import between, finite, number, short
+from diffdrive_jacobian.numerics.checks import between, number, short
 from diffdrive_jacobian.text import format_size, printable
 
 Floats = NDArray[np.float64]
@@ -42,26 +42,25 @@ COLUMNS = {
     **{'t': 't', 'time': 't', 'time_s': 't'},
 }
 """Names of the columns of a file, those of `plot_run --csv` included, to what they are."""
-_UNNAMED = {2: ('x', 'y'), 3: ('x', 'y', 'theta'), 4: ('x', 'y', 'theta', 't')}
+UNNAMED = {2: ('x', 'y'), 3: ('x', 'y', 'theta'), 4: ('x', 'y', 'theta', 't')}
 
 
 class PathError(DiffdriveError, ValueError):
     """A text is no path, or a file has none. The message says where and what is allowed."""
 
 
-def _check_size(name: str, size: float) -> None:
-    between(LEAST_SIZE, GREATEST_SIZE, unit='m')(name, size)
+_size = between(LEAST_SIZE, GREATEST_SIZE, unit='m')
 
 
 def circle_path(radius: float) -> Path:
     """Return a circle to the left, of a radius in [0.001, 1e5] (m)."""
-    radius = number('radius', radius, _check_size)
+    radius = _size('radius', radius)
     return _shape(lambda u: (radius * np.sin(u), radius * (1.0 - np.cos(u))), 2.0 * math.pi * radius)
 
 
 def line_path(length: float) -> Path:
     """Return a straight line of a length in [0.001, 1e5] (m)."""
-    length = number('length', length, _check_size)
+    length = _size('length', length)
     return _shape(lambda u: (length * u / (2.0 * math.pi), 0.0 * u), length)
 
 
@@ -71,7 +70,7 @@ def figure_eight_path(size: float) -> Path:
     With `c = a / (1 + sin(u)^2)` it is `x = c sin(u) cos(u), y = a - c cos(u)`. It is 2 a long in y, and
     narrowest at its ends, with the radius a/3. The size a is in [0.001, 1e5] (m).
     """
-    a = number('size', size, _check_size)
+    a = _size('size', size)
 
     def point(u: Floats) -> tuple[Floats, Floats]:
         c = a / (1.0 + np.sin(u) ** 2)
@@ -108,14 +107,14 @@ def planned_path(text: str) -> Path:
         raise PathError(f'{shape} needs its size (m), as in {shape}:1.0, got {short(text, repr)}')
     if shape in SHAPES:
         try:
-            return SHAPES[shape](number('size', float(size), _check_size))
+            return SHAPES[shape](_size('size', float(size)))
         except ValueError:
             raise PathError(
                 f'size of a shape must be in [{LEAST_SIZE:g}, {GREATEST_SIZE:g}] m, got '
                 f'{short(text, repr)}'
             ) from None
     file = FilePath(text)
-    read = _READERS.get(file.suffix.lower())
+    read = READERS.get(file.suffix.lower())
     if read is None:
         raise PathError(f'path must be {ALLOWED}, got {short(text, repr)}')
     try:
@@ -125,7 +124,7 @@ def planned_path(text: str) -> Path:
             raise PathError(
                 f'it must have at most {format_size(MAX_FILE_SIZE)}, got {format_size(taken)}'
             )
-        columns = read(file)
+        columns = _columns(read(file))
         poses = np.column_stack([columns['x'], columns['y'], columns.get('theta', 0.0 * columns['x'])])
         return Path(poses, columns.get('t'))
     except UnicodeDecodeError as error:
@@ -150,46 +149,31 @@ def _shape(point: Callable[[Floats], tuple[Floats, Floats]], length: float) -> P
 
 # --- Files
 
+Row: TypeAlias = tuple[str, Sequence[Any], Sequence[Any]]
+"""Where a pose stands in its file, the names of its columns, and their values."""
 
-def _read_csv(file: FilePath) -> dict[str, Floats]:
-    """Return the columns of a CSV file. Errors give the line."""
+
+def _csv_rows(file: FilePath) -> Iterator[Row]:
+    """Yield the poses of a CSV file. The first line may name the columns."""
     with open(file, encoding='utf-8-sig', newline='') as stream:
         reader = csv.reader(line for line in stream)
-        names: dict[int, str] | None = None
-        rows: list[list[float]] = []
-        width = 0
-        for row in reader:
-            cells = [cell.strip() for cell in row]
-            if not any(cells) or cells[0].startswith('#'):
+        names: Sequence[str] = ()
+        for cells in reader:
+            row = [cell.strip() for cell in cells]
+            if not any(row) or row[0].startswith('#'):
                 continue
-            if names is None:
-                names, width = _column_names(cells), len(cells)
-                if not _is_number(cells[0]):
-                    continue
             place = f'line {reader.line_num}'
-            if len(cells) != width:
-                raise PathError(f'{place} must have {width} columns, got {len(cells)}')
-            rows.append([_value(f'{place}: {name}', cells[at]) for at, name in names.items()])
-            _check_count(len(rows))
-    if names is None or not rows:
-        raise PathError('it must have a pose in each line, got none')
-    columns = np.reshape(np.array(rows, dtype=np.float64), (-1, len(names))).T
-    return dict(zip(names.values(), columns, strict=True))
+            if not names and not _is_number(row[0]):
+                names = row
+                continue
+            names = names or _names(place, row)
+            if len(row) != len(names):
+                raise PathError(f'{place} must have {len(names)} columns, got {len(row)}')
+            yield place, names, row
 
 
-def _column_names(cells: list[str]) -> dict[int, str]:
-    """Return which columns of a CSV file are which, by their index."""
-    if _is_number(cells[0]):
-        if len(cells) not in _UNNAMED:
-            raise PathError(f'columns without names must be x, y[, theta[, t]], got {len(cells)}')
-        return dict(enumerate(_UNNAMED[len(cells)]))
-    found = {at: COLUMNS[name.lower()] for at, name in enumerate(cells) if name.lower() in COLUMNS}
-    _check_names(found.values(), cells)
-    return found
-
-
-def _read_yaml(file: FilePath) -> dict[str, Floats]:
-    """Return the columns of a YAML file. Errors give the number of the pose."""
+def _yaml_rows(file: FilePath) -> Iterator[Row]:
+    """Yield the poses of a YAML file, each a map or a list."""
     # ruamel.yaml takes time to import, and the laws do not need it.
     from diffdrive_jacobian.safe_yaml import YAML_ERRORS, load_yaml
 
@@ -200,48 +184,49 @@ def _read_yaml(file: FilePath) -> dict[str, Floats]:
             raise
         raise PathError(f'it must be YAML: {error}') from error
     poses = content.get('poses') if isinstance(content, dict) else content
-    if not isinstance(poses, list) or not poses:
+    if not isinstance(poses, list):
         raise PathError(f"it must be a list of poses or have one as 'poses', got {short(content, repr)}")
-    _check_count(len(poses))
-    rows = [_named(f'pose {index}', pose) for index, pose in enumerate(poses, 1)]
-    for index, row in enumerate(rows, 1):
-        if row.keys() != rows[0].keys():
-            raise PathError(
-                f'pose {index} must have {", ".join(rows[0])} as pose 1 has, got {", ".join(row)}'
-            )
-    return {
-        name: np.array([_value(f'pose {at}: {name}', row[name]) for at, row in enumerate(rows, 1)])
-        for name in rows[0]
-    }
+    for index, pose in enumerate(poses, 1):
+        place = f'pose {index}'
+        if isinstance(pose, dict):
+            yield place, list(pose), list(pose.values())
+        elif isinstance(pose, list):
+            yield place, _names(place, pose), pose
+        else:
+            raise PathError(f'{place} must be [x, y], [x, y, theta] or a map, got {short(pose, repr)}')
 
 
-_READERS = {'.csv': _read_csv, '.yaml': _read_yaml, '.yml': _read_yaml}
+READERS = {'.csv': _csv_rows, '.yaml': _yaml_rows, '.yml': _yaml_rows}
 
 
-def _named(place: str, pose: Any) -> dict[str, Any]:
-    """Return the entries of a pose in YAML by their names."""
-    if isinstance(pose, dict):
-        found = {COLUMNS[name]: value for name, value in pose.items() if name in COLUMNS}
-        _check_names(found, [*map(str, pose)], f'{place}: ')
-        return found
-    if not isinstance(pose, list) or len(pose) not in _UNNAMED:
-        raise PathError(f'{place} must be [x, y], [x, y, theta] or a map, got {short(pose, repr)}')
-    return dict(zip(_UNNAMED[len(pose)], pose, strict=True))
-
-
-def _check_names(found: Iterable[str], got: list[str], place: str = '') -> None:
-    found = list(found)
-    if len(set(found)) < len(found):
-        raise PathError(f'{place}columns must have different names, got {short(", ".join(got))}')
-    if not {'x', 'y'} <= set(found):
+def _names(place: str, row: Sequence[Any]) -> Sequence[str]:
+    if len(row) not in UNNAMED:
         raise PathError(
-            f'{place}columns must have x and y, and may have theta and t, got {short(", ".join(got))}'
+            f'{place}: columns without names must be x, y[, theta[, t]], got {len(row)} of them'
         )
+    return UNNAMED[len(row)]
 
 
-def _check_count(count: int) -> None:
-    if count > MAX_FILE_POSES:
-        raise PathError(f'it must have at most {MAX_FILE_POSES} poses, got more')
+def _columns(rows: Iterable[Row]) -> dict[str, Floats]:
+    """Return the columns of a file by what they are."""
+    poses: list[dict[str, float]] = []
+    for place, names, values in rows:
+        if len(poses) == MAX_FILE_POSES:
+            raise PathError(f'it must have at most {MAX_FILE_POSES} poses, got more')
+        known = [COLUMNS.get(str(name).lower(), '') for name in names]
+        named = [pair for pair in zip(known, values, strict=True) if pair[0]]
+        pose = {name: _value(f'{place}: {name}', value) for name, value in named}
+        got = short(', '.join(map(str, names)))
+        if len(pose) < len(named):
+            raise PathError(f'{place}: columns must have different names, got {got}')
+        if not {'x', 'y'} <= pose.keys():
+            raise PathError(f'{place}: columns must have x and y, and may have theta and t, got {got}')
+        if poses and pose.keys() != poses[0].keys():
+            raise PathError(f'{place} must have {", ".join(poses[0])} as the first pose has, got {got}')
+        poses.append(pose)
+    if not poses:
+        raise PathError('it must have a list of poses, or a pose in each line, got none')
+    return {name: np.array([pose[name] for pose in poses]) for name in poses[0]}
 
 
 def _is_number(text: str) -> bool:
@@ -255,6 +240,6 @@ def _is_number(text: str) -> bool:
 def _value(place: str, value: Any) -> float:
     try:
         # A text comes from CSV; YAML has numbers.
-        return number(place, float(value) if isinstance(value, str) else value, finite)
+        return number(place, float(value) if isinstance(value, str) else value)
     except ValueError:
         raise PathError(f'{place} must be a finite number, got {short(value, repr)}') from None

@@ -25,10 +25,7 @@ from diffdrive_jacobian.numerics.checks import (
     boolean,
     constant,
     finite,
-    function,
-    instance,
     integer,
-    number,
     numbers,
     read_only,
 )
@@ -38,8 +35,7 @@ from diffdrive_jacobian.numerics.formula import Number, formula
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
 STANDSTILL = (0.0, 0.0)
 Law: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
-"""A control law with its gains: pose as given to `follow`, and goal, an array of shape (3,), to
-`(v, omega)`."""
+"""A control law with its gains: pose and goal, tuples of three floats, to `(v, omega)`."""
 
 
 @formula('(),(),(),(),(),() -> ()')
@@ -125,7 +121,7 @@ class Waypoints:
     """Index of the waypoint that is driven to."""
     turning: bool = False
     """Whether the last position was reached and only the heading remains."""
-    _goal: tuple[float, float, float] = field(init=False, repr=False)
+    _goal: tuple[float, ...] = field(init=False, repr=False)
     """The waypoint that is driven to."""
 
     def __post_init__(self) -> None:
@@ -133,6 +129,7 @@ class Waypoints:
         poses = array('poses', self.poses, 'n', 3)
         if poses.ndim != 2:
             raise ValueError(f'poses must have shape (n, 3), got {poses.shape}')
+        # Not copied again where the progress changes.
         object.__setattr__(self, 'poses', read_only(poses))
         index = integer('index', self.index, 0, len(poses) - 1)
         object.__setattr__(self, 'index', index)
@@ -162,44 +159,28 @@ class Waypoints:
             one and has yet to stop.
 
         Raises:
-            ValueError: An argument is of another class or shape, or not finite.
+            ValueError: The pose has another shape or is not finite.
         """
-        numbers('pose', pose, 3)
-        function('law', law)
-        instance('arrival', arrival, Arrival)
-        number('turning_gain', turning_gain, finite)
-        return self.step(pose, lambda at, goal: law(at, np.array(goal)), arrival, turning_gain, twist)
-
-    def step(
-        self,
-        pose: Pose,
-        law: Law,
-        arrival: Arrival,
-        turning_gain: float,
-        twist: tuple[float, float] = STANDSTILL,
-    ) -> tuple[Waypoints, tuple[Any, Any] | None]:
-        """As `follow`, of values that were checked. The law is given the goal as a tuple of floats."""
-        x, y, theta = pose
+        if self.turning and not arrival.use_heading:
+            # The position was reached, and the heading no longer counts.
+            return self, None
+        x, y, theta = numbers('pose', pose, 3)
+        index, goal = self.index, self._goal
+        there = self.turning or arrival.reached(x, y, theta, goal[0], goal[1])
+        while there and not self.turning and index + 1 < len(self.poses):
+            index += 1
+            goal = tuple(self.poses[index].tolist())
+            there = arrival.reached(x, y, theta, goal[0], goal[1])
+        stopped = arrival.stopped(*twist)
+        turning = self.turning or (there and arrival.use_heading and stopped)
         here = self
-        if here.turning and not arrival.use_heading:
-            # The heading no longer counts, and the position was reached.
-            return here, None
-        while not here.turning:
-            goal = here._goal
-            if not arrival.reached(x, y, theta, goal[0], goal[1]):
-                return here, law(pose, goal)
-            if here.index + 1 < len(here.poses):
-                here = here._progressed(here.index + 1, turning=False)
-            elif not arrival.stopped(*twist):
-                return here, STANDSTILL
-            elif arrival.use_heading:
-                here = here._progressed(here.index, turning=True)
-            else:
-                return here, None
-        heading = here._goal[2]
-        if arrival.faces(theta, heading):
-            return here, None if arrival.stopped(*twist) else STANDSTILL
-        return here, turn_in_place(theta, heading, turning_gain)
+        if (index, turning) != (self.index, self.turning):
+            here = Waypoints(self.poses, index, turning)
+        if not there:
+            return here, law((x, y, theta), goal)
+        if turning and not arrival.faces(theta, goal[2]):
+            return here, turn_in_place.formula(theta, goal[2], turning_gain)
+        return here, None if stopped else STANDSTILL
 
     def remaining(self, pose: Pose, arrival: Arrival, turn: float = 0.0) -> tuple[float, float]:
         """Return how far a robot may still roll and turn, so that it can stop at the last goal (m, rad).
@@ -237,13 +218,4 @@ class Waypoints:
 
         Needed when the law or the driven point changes while the robot turns in place.
         """
-        return self._progressed(self.index, turning=False) if self.turning else self
-
-    def _progressed(self, index: int, *, turning: bool) -> Waypoints:
-        # Without checks and copies, which would cost time in proportion to the number of poses.
-        progressed = object.__new__(Waypoints)
-        goal = tuple(self.poses[index].tolist())
-        values = {'poses': self.poses, 'index': index, 'turning': turning, '_goal': goal}
-        for name, value in values.items():
-            object.__setattr__(progressed, name, value)
-        return progressed
+        return Waypoints(self.poses, self.index) if self.turning else self

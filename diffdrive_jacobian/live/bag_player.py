@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.bags.bag_reader import BagError, open_bag
 from diffdrive_jacobian.bags.run import Run, Series, read_run
 from diffdrive_jacobian.bags.timeline import jumps, seconds, timeline
-from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
 from diffdrive_jacobian.live.quantities import rounded
@@ -250,7 +250,7 @@ class RecordedRobot:
         """Return the recorded parameters that the page shows."""
         values = self._state.controller_values
         # Of another package it may be missing here, or a later one.
-        controller = BUILT_IN.get(str(values.get('controller', '')))
+        controller = CONTROLLERS.built_in.get(str(values.get('controller', '')))
         return settings.shown(
             {'controller': values, 'robot': self._state.robot_values},
             controller.gains if controller else settings.recorded_gains(values),

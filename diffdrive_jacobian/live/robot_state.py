@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.bags.run import number
 from diffdrive_jacobian.bags.timeline import heading_counts
 from diffdrive_jacobian.control import Arrival, LawError, Path
-from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.control.path import PathProgress
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.live import quantities
@@ -303,7 +303,7 @@ class RobotState:
         """Arrival criterion of the controller."""
         values = self.controller_values
         tolerance = _number(values, 'xy_goal_tolerance', CONTROLLER_DEFAULTS.xy_goal_tolerance)
-        controller = BUILT_IN.get(str(values.get('controller')))
+        controller = CONTROLLERS.built_in.get(str(values.get('controller')))
         offset = 0.0
         if controller is not None and controller.offset:
             offset = _number(values, controller.offset, CONTROLLER_DEFAULTS.offset)
@@ -423,7 +423,7 @@ class RobotState:
             return {'name': name, 'gains': {}, 'twist': None}
         name = str(values.get('controller', ''))[:64]
         # Only built-in ones: another one may be slow, and runs in the controller.
-        controller = BUILT_IN.get(name)
+        controller = CONTROLLERS.built_in.get(name)
         if controller is None:
             return {'name': name, 'gains': {}, 'twist': None}
         gains = {gain.name: _number(values, gain.name, math.nan) for gain in controller.gains}

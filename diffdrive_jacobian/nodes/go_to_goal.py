@@ -457,7 +457,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             if command is not None:
                 return command
             self._leave_path(goal, goal.path)
-        goal.waypoints, command = goal.waypoints.step(
+        goal.waypoints, command = goal.waypoints.follow(
             pose, self._law, self._arrival, self.parameters.kp, self._twist
         )
         return command

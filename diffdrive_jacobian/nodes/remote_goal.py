@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control import Arrival, Path
-from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, driven_offset
@@ -405,7 +405,7 @@ def ignores_heading(values: Mapping[str, Any]) -> bool:
 
     Other controllers than the built-in ones may take it.
     """
-    controller = BUILT_IN.get(str(values.get('controller')))
+    controller = CONTROLLERS.built_in.get(str(values.get('controller')))
     return (
         values.get('use_goal_heading') is False
         and controller is not None

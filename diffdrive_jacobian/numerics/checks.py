@@ -347,9 +347,11 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def read_only(value: Any) -> Array:
-    """Return a read-only copy of an array, for immutable objects."""
+    """Return a read-only array, for immutable objects: a copy of one that may be written to."""
     import numpy as np
 
+    if type(value) is np.ndarray and value.base is None and not value.flags.writeable:
+        return value
     copy = np.array(value, dtype=np.float64)
     copy.setflags(write=False)
     return copy

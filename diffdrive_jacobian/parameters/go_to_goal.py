@@ -19,10 +19,8 @@ from diffdrive_jacobian.control.controller import (
 )
 from diffdrive_jacobian.control.controllers import (
     ALL_PATH_CONTROLLERS,
-    AnyControllers,
     ControllerError,
     Controllers,
-    PathControllers,
 )
 from diffdrive_jacobian.control.controllers import CONTROLLERS as CONTROLLERS
 from diffdrive_jacobian.control.path_following import PathSettings
@@ -54,7 +52,7 @@ MIN_OFFSET = 1e-3
 """Smallest absolute offset (m). The yaw rate of the law is proportional to the inverse of the offset."""
 
 
-def _controller(default: str, choices: AnyControllers[Any]) -> Any:
+def _controller(default: str, choices: Controllers[Any]) -> Any:
     laws = '; '.join(f'{name}, {one.summary}' for name, one in choices.built_in.items())
     names = ', '.join(map(repr, choices.built_in))
     return parameter(
@@ -85,9 +83,9 @@ class GoToGoalParameters(TwistParameters):
     they say what the robot can do.
     """
 
-    controllers: ClassVar[Controllers] = CONTROLLERS
+    controllers: ClassVar[Controllers[Controller]] = CONTROLLERS
     """The controllers that can be chosen."""
-    path_controllers: ClassVar[PathControllers] = ALL_PATH_CONTROLLERS
+    path_controllers: ClassVar[Controllers[PathController]] = ALL_PATH_CONTROLLERS
     """Those of paths."""
 
     declared_gains: ClassVar[Mapping[str, Gain]] = {
@@ -165,15 +163,15 @@ class GoToGoalParameters(TwistParameters):
         Raises:
             ValueError: It is not a Controller, or has the name of a built-in one.
         """
-        return cls._with_default(controller, Controllers(controller))
+        return cls._with_default(controller, CONTROLLERS.with_controller(controller))
 
     @classmethod
     def with_path_controller(cls, controller: PathController) -> type[GoToGoalParameters]:
         """As `with_controller`, for a controller of paths."""
-        return cls._with_default(controller, PathControllers(controller))
+        return cls._with_default(controller, ALL_PATH_CONTROLLERS.with_controller(controller))
 
     @classmethod
-    def _with_default(cls, controller: C, known: AnyControllers[C]) -> type[GoToGoalParameters]:
+    def _with_default(cls, controller: C, known: Controllers[C]) -> type[GoToGoalParameters]:
         choice = (known.parameter, str, _controller(controller.name, known))
         return cls._subclass([choice], {f'{known.parameter}s': known})
 
@@ -189,7 +187,7 @@ class GoToGoalParameters(TwistParameters):
 
     @classmethod
     def _with_gains(
-        cls, controllers: AnyControllers[Any], values: Mapping[str, Any]
+        cls, controllers: Controllers[Any], values: Mapping[str, Any]
     ) -> type[GoToGoalParameters]:
         parameter = controllers.parameter
         name = values.get(parameter, default_of(cls, parameter))
@@ -289,7 +287,7 @@ class GoToGoalParameters(TwistParameters):
         )
 
 
-def _found(controllers: AnyControllers[C], name: str) -> C:
+def _found(controllers: Controllers[C], name: str) -> C:
     try:
         return controllers.find(name)
     except ControllerError as error:

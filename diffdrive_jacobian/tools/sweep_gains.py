@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from diffdrive_jacobian.control import Controller, ControllerError
-from diffdrive_jacobian.control.controllers import BUILT_IN, CONTROLLERS
+from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.errors import DiffdriveError, UserError
 from diffdrive_jacobian.parameters.declaration import from_ros
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
@@ -172,7 +172,7 @@ def _robot(options: argparse.Namespace) -> RobotModel:
     return from_ros(VirtualRobotParameters, values).model()
 
 
-def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
+def _parser(controller: Controller = CONTROLLERS.built_in['go_to_goal']) -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} [options]',

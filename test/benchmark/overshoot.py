@@ -14,7 +14,7 @@ import argparse
 import numpy as np
 
 from diffdrive_jacobian.control import Arrival, VelocityLimits
-from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.simulation import (
     AccelerationLimits,
     Actuators,
@@ -59,7 +59,7 @@ def main() -> None:
     count = 12 if parser.parse_args().quick else STARTS
     print('| controller | robot | arrived | time, mean, max | overshoot, max | rest, max |')
     print('|---|---|---:|---:|---:|---:|')
-    for name, controller in BUILT_IN.items():
+    for name, controller in CONTROLLERS.built_in.items():
         starts = SweepSetup(controller=name, starts=count).poses()
         arrival = Arrival(
             use_heading=controller.takes_heading, offset=controller.driven_offset(controller.defaults)

@@ -6,6 +6,7 @@ import re
 from itertools import count
 from pathlib import Path
 
+from diffdrive_jacobian.control.controllers import ALL_PATH_CONTROLLERS, CONTROLLERS
 from diffdrive_jacobian.live import settings
 
 PAGE = (Path(__file__).parents[2] / 'doc' / 'controllers.md').read_text()
@@ -28,7 +29,8 @@ class Site:
         path.mkdir()
         self._path = path
         monkeypatch.syspath_prepend(str(path))
-        monkeypatch.setattr('diffdrive_jacobian.control.controllers._loaded', {})
+        for known in (CONTROLLERS, ALL_PATH_CONTROLLERS):
+            monkeypatch.setattr(known, '_known', dict(known.built_in))
         settings.gains.cache_clear()
 
     def install(self, name, source=None, *, package=None, version='1.2'):

@@ -18,7 +18,7 @@ from diffdrive_jacobian.control import (
     offset_point,
     saturate,
 )
-from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loop, closed_loops, trajectories
@@ -46,7 +46,7 @@ def alone(law, start, to, gains, arrival, limits=FREE, *, rate=50.0, duration=6.
     along = (to - start)[:2] / (math.dist(to[:2], start[:2]) or 1.0)
     while True:
         beyond = max(beyond, float(along @ (pose - to)[:2]))
-        way, command = way.follow(pose, lambda at, goal: law(at, goal, *gains), arrival, 3.0)
+        way, command = way.follow(pose, lambda at, goal: law(at, np.array(goal), *gains), arrival, 3.0)
         if command is None:
             time = step / rate
         if command is None or step == round(duration * rate):
@@ -80,7 +80,7 @@ def test_a_batch_is_each_of_its_robots_in_a_scalar_loop(name, limits):
     gone = trajectories(law, starts, targets, *gains, **how)
     assert_same(closed_loops(law, starts, targets, *gains, **how), gone.outcomes)
     goals = targets if use_heading else targets[:, :2]
-    assert_same(closed_loops(BUILT_IN[name], starts, goals, *gains, **how), gone.outcomes)
+    assert_same(closed_loops(CONTROLLERS.built_in[name], starts, goals, *gains, **how), gone.outcomes)
     assert_allclose(gone.times, np.arange(len(gone.poses)) / 25.0, rtol=1e-12)
     for index, (start, to) in enumerate(zip(starts, targets, strict=True)):
         expected, poses = alone(law, start, to, gains, arrival, limits, duration=4.0, rate=25.0)
@@ -245,7 +245,7 @@ def test_invalid_gains_and_shapes_of_options_are_named():
             with pytest.raises(ValueError, match=rf'\b{name}\b'):
                 drive(go_to_goal, *batch, gain, **options)
     with pytest.raises(ValueError, match='law rejects the starts, goals and gains: d must be'):
-        closed_loops(BUILT_IN['offset_point'], *batch, 0.0)
+        closed_loops(CONTROLLERS.built_in['offset_point'], *batch, 0.0)
 
 
 # --- Robots that take time
@@ -283,13 +283,21 @@ def test_robots_that_take_time_drive_as_one_of_the_nodes_alone(name):
     many = {'duration': 1.6, 'arrival': arrival, 'limits': LIMITS, 'actuators': FOLLOWING[name]}
     gone = trajectories(law, starts, targets, *gains, **many)
     assert_same(closed_loops(law, starts, targets, *gains, **many), gone.outcomes)
+
+    def bound(pose, goal):
+        return law(pose, np.array(goal), *gains)
+
     for index, (start, to) in enumerate(zip(starts, targets, strict=True)):
         robot, way, arrived = Robot(model=model, stamp=0, pose=start), Waypoints(to[np.newaxis]), None
         for time, pose in zip(gone.times, gone.poses[:, index], strict=True):
             assert np.abs(se2.log(se2.compose(se2.inverse(pose), robot.pose))).max() < 2e-9
             if arrived is None:
                 way, command = way.follow(
-                    robot.pose, lambda at, goal: law(at, goal, *gains), arrival, 3.0, robot.twist
+                    robot.pose,
+                    lambda at, goal: law(at, np.array(goal), *gains),
+                    arrival,
+                    3.0,
+                    robot.twist,
                 )
                 arrived = time if command is None else None
             command = command or (0.0, 0.0)

@@ -19,7 +19,7 @@ from diffdrive_jacobian import control
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.control import KP, KV, OFFSET, ControllerError, LawError, find_controller
-from diffdrive_jacobian.control.controllers import BUILT_IN, Controllers
+from diffdrive_jacobian.control.controllers import CONTROLLERS, controller_names
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import ParameterError
@@ -49,7 +49,7 @@ def test_the_example_is_installed_and_drives_and_its_bag_is_read_without_it(site
     assert commands.run('drive_to', *arguments, '--ros-args', '-p', 'kv:=4.0').code == 0
     # Without the package.
     monkeypatch.delitem(sys.modules, 'my_law')
-    monkeypatch.setattr('diffdrive_jacobian.control.controllers._loaded', {})
+    monkeypatch.setattr(CONTROLLERS, '_known', dict(CONTROLLERS.built_in))
     read = timeline(read_run(tmp_path / 'bag'))
     assert read.run.of_node('go_to_goal')['controller'] == 'my_law'
     expected = law(read.run.odometry.values[0, :3], np.array([0.4, 0.2]), 3.0, 4.0)
@@ -65,10 +65,10 @@ def test_the_example_is_installed_and_drives_and_its_bag_is_read_without_it(site
 def test_names_are_listed_and_checked_without_an_import(site):
     module = site.install('named')
     # A user may have installed others.
-    assert {*BUILT_IN, 'named'} <= {*control.controller_names()}
+    assert {*CONTROLLERS.built_in, 'named'} <= {*control.controller_names()}
     assert list(control.controller_names()) == sorted(control.controller_names())
-    assert 'named' in Controllers()
-    assert 'unnamed' not in Controllers()
+    assert 'named' in controller_names()
+    assert 'unnamed' not in controller_names()
     with pytest.raises(ParameterError, match=r"one of '.*'named', .*, got 'other'"):
         GoToGoalParameters(controller='other')
     for command in ('drive_to', 'sweep_gains', 'go_to_goal'):
@@ -80,9 +80,9 @@ def test_names_are_listed_and_checked_without_an_import(site):
 
 def test_built_in_controllers_cannot_be_replaced(site):
     site.install('pose')
-    assert control.controller_names() == tuple(BUILT_IN)
-    for name in BUILT_IN:
-        assert GoToGoalParameters(controller=name).chosen_controller() is BUILT_IN[name]
+    assert control.controller_names() == tuple(CONTROLLERS.built_in)
+    for name in CONTROLLERS.built_in:
+        assert GoToGoalParameters(controller=name).chosen_controller() is CONTROLLERS.built_in[name]
 
 
 BROKEN = {
@@ -152,11 +152,11 @@ def test_only_controllers_with_a_name_of_their_own_can_be_given(lockstep):
             GoToGoalParameters.with_controller(bad)
     with pytest.raises(ValueError, match="name of its own, got 'pose', which is built in"):
         GoToGoal(controller=replace(MINE, name='pose'))
-    assert GoToGoal(controller=BUILT_IN['pose']).get_parameter('controller').value == 'pose'
+    assert GoToGoal(controller=CONTROLLERS.built_in['pose']).get_parameter('controller').value == 'pose'
 
 
 def test_heading_and_driven_point_of_a_given_controller_count(lockstep):
-    controller = replace(BUILT_IN['offset_point'], name='point', takes_heading=True)
+    controller = replace(CONTROLLERS.built_in['offset_point'], name='point', takes_heading=True)
     controller = replace(controller, law=lambda pose, to, k, d: control.offset_point(pose, to[:2], k, d))
     node = lockstep.add(GoToGoal(controller=controller))
     assert (node.arrival.offset, node.arrival.use_heading) == (0.1, True)
@@ -185,11 +185,11 @@ def test_advice_is_logged_and_its_failure_does_no_harm(lockstep, capfd):
 
 FAILURES = (
     (lambda *_: 1.0 / 0.0, "controller 'my_law' failed: ZeroDivisionError: float division"),
-    (lambda *_: (math.nan, 0.0), 'must return finite (v, omega), got (nan, 0)'),
-    (lambda *_: (1.0, 2.0, 3.0), 'must return (v, omega), two numbers, got (1.0, 2.0, 3.0)'),
-    (lambda *_: 0.5, 'two numbers, got 0.5'),
-    (lambda *_: ([1.0], [2.0]), 'two numbers, got'),
-    (lambda *_: ('1', None), 'two numbers, got'),
+    (lambda *_: (math.nan, 0.0), 'two finite numbers, got (nan, 0.0)'),
+    (lambda *_: (1.0, 2.0, 3.0), 'must return (v, omega), two finite numbers, got (1.0, 2.0, 3.0)'),
+    (lambda *_: 0.5, 'two finite numbers, got 0.5'),
+    (lambda *_: ([1.0], [2.0]), 'two finite numbers, got'),
+    (lambda *_: ('1', None), 'two finite numbers, got'),
 )
 
 

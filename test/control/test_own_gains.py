@@ -163,7 +163,9 @@ def test_gains_named_as_options_are_swept_under_another_name(monkeypatch, tmp_pa
             Gain(name='k_beta', default=-0.5),
         ),
     )
-    monkeypatch.setattr(sweep_gains.CONTROLLERS, '_given', {'polar': odd})
+    monkeypatch.setattr(
+        sweep_gains.CONTROLLERS, '_known', {**sweep_gains.CONTROLLERS.built_in, 'polar': odd}
+    )
     monkeypatch.chdir(tmp_path)
     arguments = ('--controller', 'polar', '--gain-grid', '0.3', '0.6', '--gain-max_velocity', '1', '2')
     more = ('--k_beta', '-0.3', '--max-velocity', '1', *SMALL)
@@ -267,9 +269,9 @@ def test_an_equation_may_have_a_state_too_and_time_that_goes_back_is_no_time():
 
 def test_an_invalid_state_is_named():
     for result, words in (
-        ((0.0, 0.0), 'two numbers, and the state, shape (1,), got (0.0, 0.0)'),
+        ((0.0, 0.0), 'two finite numbers, and the state, shape (1,), got (0.0, 0.0)'),
         ((0.0, 0.0, [1.0, 2.0]), 'and the state, shape (1,)'),
-        ((0.0, 0.0, [math.nan]), 'must return finite (v, omega), got (0, 0) and the state [nan]'),
+        ((0.0, 0.0, [math.nan]), 'two finite numbers, and the state, shape (1,), got (0.0, 0.0, [nan])'),
     ):
         own = replace(INTEGRAL, law=lambda *_, result=result, **__: result)
         with pytest.raises(LawError, match=re.escape(words)):

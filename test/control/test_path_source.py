@@ -81,7 +81,7 @@ BAD_FILES = [
     ('a.yaml', b'[[0, 0], 3]', 'pose 2 must be .x, y., .x, y, theta. or a map, got 3'),
     ('a.yaml', b'[[0, 0], [1, .nan]]', 'pose 2: y must be a finite number, got nan'),
     ('a.yaml', b'[[0, 0], [1, true]]', 'pose 2: y must be a finite number, got True'),
-    ('a.yaml', b'[[0, 0], [1, 2, 3]]', 'pose 2 must have x, y as pose 1 has'),
+    ('a.yaml', b'[[0, 0], [1, 2, 3]]', 'pose 2 must have x, y as the first pose has'),
     ('a.yaml', b'[{x: 1}]', 'pose 1: columns must have x and y'),
     ('a.txt', b'1,2\n', 'path must be circle:RADIUS'),
 ]

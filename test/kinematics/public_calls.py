@@ -47,6 +47,10 @@ def law(pose, goal):
     return 0.1, 0.2
 
 
+def follow(pose):
+    return WAYPOINTS.follow(pose, law, Arrival(), 3.0)
+
+
 def closed_loops(starts, goals, law, **options):
     return simulation.closed_loops(law, starts, goals, 3.0, 0.5, **options)
 
@@ -157,7 +161,7 @@ OTHERS = {
     SpatialArm: {'a': (0.1, 0.4), 'alpha': (1.5, 0.0), 'd': (0.2, 0.1), 'theta': (0.0, 0.5)},
     MobileManipulator: {**WHEELS, 'arm': ARM, 'mount': (0.1, 0.0)},
     Waypoints: {'poses': [POSE], 'index': 0, 'turning': False},
-    WAYPOINTS.follow: {'pose': POSE, 'law': law, 'arrival': Arrival(), 'turning_gain': 3.0},
+    follow: {'pose': POSE},
     StraightLine: {'start': [0.0, 0.0], 'end': [1.0, 0.0], 'speed': 0.1},
     LINE.position: {'t': 0.5},
     Drift: {'seed': 3, 'right_wheel_radius_multiplier': 1.01, 'left_wheel_radius_multiplier': 0.99}

@@ -569,7 +569,7 @@ NAN, INF = np.nan, np.inf
         ('target', [1.0, np.zeros((3, 0))], r'have shape \(\.\.\., m\)'),
         ('target', [[NAN, 0.0]], 'be finite'),
         ('q0', [[[0.0, 1.0], [0.0]]], 'be an array of real numbers'),
-        ('method', ['gauss', None], 'be one of 'newton', 'transpose', 'levenberg_marquardt''),
+        ('method', ['gauss', None], "be one of 'newton', 'transpose', 'levenberg_marquardt'"),
         ('mask', [[1.0], 1.0, np.ones((1, 2))], r'have shape \(2,\)'),
         ('mask', [[0, 0]], 'have an entry that is not zero'),
         ('mask', [[1.0, -1.0], [1.0, NAN]], 'be zero or positive and finite'),

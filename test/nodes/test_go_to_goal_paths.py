@@ -24,7 +24,7 @@ from support.lockstep_nodes import (
 from support.ros_messages import goal, goals, odometry, path, pose_of, spoiled, twists
 
 from diffdrive_jacobian.control import Path, PathController
-from diffdrive_jacobian.control.controllers import PathControllers
+from diffdrive_jacobian.control.controllers import ALL_PATH_CONTROLLERS
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -63,7 +63,7 @@ def controller(lockstep):
 # --- Paths that are driven
 
 
-@pytest.mark.parametrize('law', tuple(PathControllers()))
+@pytest.mark.parametrize('law', tuple(ALL_PATH_CONTROLLERS))
 def test_a_path_is_reached_followed_and_driven_to_its_end_without_a_stop(lockstep, law):
     """A quarter of a circle, from beside it: within 1 cm after a part of it."""
     quarter = path(*circle(32, 1.0)[:9])
@@ -131,7 +131,7 @@ def test_a_user_has_a_path_law_of_his_own(lockstep):
         x, y, *_ = np.moveaxis(references, -1, 0)
         return gain * (x - poses[..., 0]), gain * (y - poses[..., 1])
 
-    mine = PathController(name='mine', law=law, gains=(PathControllers().find('kanayama').gains[1],))
+    mine = PathController(name='mine', law=law, gains=(ALL_PATH_CONTROLLERS.find('kanayama').gains[1],))
     node = lockstep.add(GoToGoal(path_controller=mine))
     assert node.get_parameter('path_controller').value == 'mine'
     (gain,) = [node.get_parameter(one.name).value for one in mine.gains]
