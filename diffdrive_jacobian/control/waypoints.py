@@ -26,7 +26,6 @@ from diffdrive_jacobian.numerics.checks import (
     constant,
     finite,
     integer,
-    numbers,
     read_only,
 )
 from diffdrive_jacobian.numerics.elementary import hypot, wrap
@@ -158,26 +157,25 @@ class Waypoints:
             command is None when all waypoints are reached. It is zero where the robot is at the last
             one and has yet to stop.
 
-        Raises:
-            ValueError: The pose has another shape or is not finite.
+        What the law raises is passed on. The pose is not checked again.
         """
         if self.turning and not arrival.use_heading:
             # The position was reached, and the heading no longer counts.
             return self, None
-        x, y, theta = numbers('pose', pose, 3)
+        x, y, theta = pose
         index, goal = self.index, self._goal
         there = self.turning or arrival.reached(x, y, theta, goal[0], goal[1])
         while there and not self.turning and index + 1 < len(self.poses):
             index += 1
             goal = tuple(self.poses[index].tolist())
             there = arrival.reached(x, y, theta, goal[0], goal[1])
-        stopped = arrival.stopped(*twist)
-        turning = self.turning or (there and arrival.use_heading and stopped)
+        stopped = there and arrival.stopped(*twist)
+        turning = self.turning or (stopped and arrival.use_heading)
         here = self
         if (index, turning) != (self.index, self.turning):
             here = Waypoints(self.poses, index, turning)
         if not there:
-            return here, law((x, y, theta), goal)
+            return here, law(pose, goal)
         if turning and not arrival.faces(theta, goal[2]):
             return here, turn_in_place.formula(theta, goal[2], turning_gain)
         return here, None if stopped else STANDSTILL

@@ -28,7 +28,6 @@ MODEL = RobotModel(limits=LIMITS, command_timeout=10**9)
 ROBOT = Robot(model=MODEL, stamp=0, pose=np.array(POSE)).commanded(TWIST, 0)
 DRIFTING = Robot(model=dataclasses.replace(MODEL, drift=Drift(seed=3)), stamp=0, pose=np.array(POSE))
 LINE = StraightLine([0.0, 0.0], [1.0, 0.0], 0.1)
-WAYPOINTS = Waypoints([[1.0, 0.0, 0.0], [1.0, 1.0, 2.0]])
 ARM = PlanarArm([1.0, 0.7])
 MANIPULATOR = MobileManipulator(0.033, 0.16, ARM)
 SPATIAL = SpatialArm([0.1, 0.4, 0.3, 0.0, 0.1], [1.5, 0.0, 0.3, -1.5, 0.0], 0.2, prismatic=(2,))
@@ -41,14 +40,6 @@ LOOP = {
     **{'law': control.go_to_goal, 'starts': POSE, 'goals': GOAL, 'rate': 10.0, 'duration': 0.3},
     **{'turning_gain': 3.0, **WHEELS, 'arrival': Arrival(), 'limits': LIMITS},
 }
-
-
-def law(pose, goal):
-    return 0.1, 0.2
-
-
-def follow(pose):
-    return WAYPOINTS.follow(pose, law, Arrival(), 3.0)
 
 
 def closed_loops(starts, goals, law, **options):
@@ -161,7 +152,6 @@ OTHERS = {
     SpatialArm: {'a': (0.1, 0.4), 'alpha': (1.5, 0.0), 'd': (0.2, 0.1), 'theta': (0.0, 0.5)},
     MobileManipulator: {**WHEELS, 'arm': ARM, 'mount': (0.1, 0.0)},
     Waypoints: {'poses': [POSE], 'index': 0, 'turning': False},
-    follow: {'pose': POSE},
     StraightLine: {'start': [0.0, 0.0], 'end': [1.0, 0.0], 'speed': 0.1},
     LINE.position: {'t': 0.5},
     Drift: {'seed': 3, 'right_wheel_radius_multiplier': 1.01, 'left_wheel_radius_multiplier': 0.99}
