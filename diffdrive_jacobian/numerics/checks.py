@@ -312,6 +312,18 @@ def numbers(name: str, value: Any, size: int) -> tuple[float, ...]:
     return tuple(result.tolist())
 
 
+def pair(name: str, value: Any) -> tuple[float, float]:
+    """Require two finite numbers. Returns floats."""
+    first, second = numbers(name, value, 2)
+    return first, second
+
+
+def triple(name: str, value: Any) -> tuple[float, float, float]:
+    """Require three finite numbers. Returns floats."""
+    first, second, third = numbers(name, value, 3)
+    return first, second, third
+
+
 def semidefinite(name: str, value: Array) -> Array:
     """Require covariance matrices, shape (..., n, n): symmetric and positive semidefinite."""
     import numpy as np

@@ -83,6 +83,16 @@ def sqrt(x: Any) -> Any:
     return math.sqrt(x) if type(x) is float else np.sqrt(x)
 
 
+def exp(x: Any) -> Any:
+    """Exponential function."""
+    return math.exp(x) if type(x) is float else np.exp(x)
+
+
+def expm1(x: Any) -> Any:
+    """Compute exp(x) - 1 to full precision."""
+    return math.expm1(x) if type(x) is float else np.expm1(x)
+
+
 def maximum(*values: Any) -> Any:
     """The largest one."""
     return max(values) if _are_floats(values) else functools.reduce(np.maximum, values)

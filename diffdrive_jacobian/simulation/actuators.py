@@ -17,31 +17,24 @@ from typing import Annotated, NamedTuple, Protocol, TypeAlias
 
 from diffdrive_jacobian.numerics.checks import (
     Checked,
+    NegativeOrInfinite,
     NotNegativeOrInfinite,
     PositiveOrInfinite,
     nanoseconds,
     not_negative,
     number,
     positive,
-    positive_or_infinite,
-    short,
 )
+from diffdrive_jacobian.numerics.elementary import maximum, minimum, where
+from diffdrive_jacobian.numerics.formula import Number
 from diffdrive_jacobian.simulation.speeds import Piece, Profile, Twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 SHORTEST = 1e-9
 """Shortest duration of a part of a transition, the resolution of times (s)."""
-
-
-def _negative(name: str, value: object) -> float:
-    """Require a negative number; minus infinity is allowed."""
-    try:
-        return -number(name, -value, positive_or_infinite)  # type: ignore[operator]
-    except (TypeError, ValueError):
-        raise ValueError(f'{name} must be negative or -inf, got {short(value, repr)}') from None
-
-
-NegativeOrInfinite = Annotated[float, _negative]
+NumberPair: TypeAlias = tuple[Number, Number]
+Speeds: TypeAlias = tuple[float, float]
+"""`(omega_R, omega_L)` (rad/s)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -61,11 +54,11 @@ class AxisLimits(Checked):
     max_deceleration_reverse: PositiveOrInfinite = math.inf
     """Of a negative speed that rises, positive."""
 
-    def rate(self, speed: float, change: float) -> float:
+    def rate(self, speed: Number, change: Number) -> Number:
         """Return the largest rate, not negative, of a change in the direction of `change`."""
-        if change > 0.0:
-            return self.max_deceleration_reverse if speed < 0.0 else self.max_acceleration
-        return -self.max_deceleration if speed > 0.0 else -self.max_acceleration_reverse
+        rising = where(speed < 0.0, self.max_deceleration_reverse, self.max_acceleration)
+        falling = where(speed > 0.0, -self.max_deceleration, -self.max_acceleration_reverse)
+        return where(change > 0.0, rising, falling)
 
     @property
     def unlimited(self) -> bool:
@@ -95,51 +88,50 @@ class AccelerationLimits(Checked):
         return self.v.unlimited and self.omega.unlimited and self.max_wheel_acceleration == math.inf
 
     def transition(
-        self, start: Twist, target: Twist, wheel_speeds: Callable[[float, float], Twist]
-    ) -> Iterator[tuple[float, Twist]]:
+        self, start: NumberPair, target: NumberPair, wheel_speeds: Callable[[Number, Number], NumberPair]
+    ) -> Iterator[tuple[Number, NumberPair]]:
         """Yield the parts of the fastest transition along the straight line from one twist to another.
 
-        `wheel_speeds` maps a twist to the wheel speeds (rad/s), linearly.
+        `wheel_speeds` maps a twist to the wheel speeds (rad/s), linearly. Twists are those of one robot,
+        of floats, or of many, of arrays.
 
         Yields:
             The duration of each part, and the twist at its end. Within a part both speeds are linear in
             time. A jump, where there is no limit, and what takes less than `SHORTEST` have no duration.
         """
-        (v, omega), dv, domega = start, target[0] - start[0], target[1] - start[1]
-        wheels = max(map(abs, wheel_speeds(dv, domega)))
+        (v, omega), (v_target, omega_target) = start, target
+        dv, domega = v_target - v, omega_target - omega
+        wheels = maximum(*map(abs, wheel_speeds(dv, domega)))
         # Where v or omega changes its sign, as a share of the transition.
-        v_share, omega_share = _zero(v, dv), _zero(omega, domega)
+        v_zero, omega_zero = _zero(v, dv), _zero(omega, domega)
         share, here = 0.0, start
-        for end in sorted({v_share, omega_share, 1.0}):
-            there = target
-            if end < 1.0:
-                there = (
-                    0.0 if end == v_share else v + dv * end,
-                    0.0 if end == omega_share else omega + domega * end,
-                )
-            middle = (here[0] + there[0]) / 2.0, (here[1] + there[1]) / 2.0
+        for end in (minimum(v_zero, omega_zero), maximum(v_zero, omega_zero), 1.0):
+            there = (
+                where(end == 1.0, v_target, where(end == v_zero, 0.0, v + dv * end)),
+                where(end == 1.0, omega_target, where(end == omega_zero, 0.0, omega + domega * end)),
+            )
             # The time for the whole transition at the rates of this part; at no limit zero.
-            seconds = max(
-                abs(dv) / self.v.rate(middle[0], dv),
-                abs(domega) / self.omega.rate(middle[1], domega),
+            seconds = maximum(
+                abs(dv) / self.v.rate((here[0] + there[0]) / 2.0, dv),
+                abs(domega) / self.omega.rate((here[1] + there[1]) / 2.0, domega),
                 wheels / self.max_wheel_acceleration,
             )
             duration = seconds * (end - share)
-            yield duration if duration >= SHORTEST else 0.0, there
+            yield where(duration >= SHORTEST, duration, 0.0), there
             share, here = end, there
 
 
-def _zero(speed: float, change: float) -> float:
+def _zero(speed: Number, change: Number) -> Number:
     """Return the share of a change after which a speed is zero; 1.0 if it is not on the way."""
-    return -speed / change if min(speed, speed + change) < 0.0 < max(speed, speed + change) else 1.0
+    end = speed + change
+    crosses = (minimum(speed, end) < 0.0) & (maximum(speed, end) > 0.0)
+    return where(crosses, -speed / where(crosses, change, 1.0), 1.0)
 
 
 SETTLING = 36.0
 """Time constants after which a lagging wheel has reached its speed: exp(-36) is 2e-16."""
 
 STANDSTILL = (0.0, 0.0)
-Speeds: TypeAlias = tuple[float, float]
-"""`(omega_R, omega_L)` (rad/s)."""
 
 
 class Wheels(Protocol):
@@ -163,20 +155,18 @@ def _duration(name: str, value: object) -> int:
 Duration = Annotated[int, _duration]
 
 
-def time_constant(name: str, value: object) -> float:
+def time_constant(name: str, value: object, words: str = '') -> float:
     """Require a time constant that is at least the resolution of times (s)."""
     seconds = number(name, value, positive)
     if seconds < SHORTEST:
-        raise ValueError(f'{name} must be at least {SHORTEST:g} s, got {seconds!r}')
+        raise ValueError(f'{name} must be {words}at least {SHORTEST:g} s, got {seconds!r}')
     return seconds
 
 
 def _lag(name: str, value: object) -> float:
     """Require zero or a time constant (s)."""
     seconds = number(name, value, not_negative)
-    if 0.0 < seconds < SHORTEST:
-        raise ValueError(f'{name} must be 0 or at least {SHORTEST:g} s, got {seconds!r}')
-    return seconds
+    return seconds and time_constant(name, seconds, '0 or ')
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -228,7 +218,9 @@ class Actuators(Checked):
 
         Without `wheels` the limit of their acceleration is left out.
         """
-        seconds = self.reaction + self._deceleration_time(twist, wheels) / 2.0
+        wheel_speeds = (lambda *_: STANDSTILL) if wheels is None else wheels.wheel_speeds
+        parts = self.acceleration.transition(twist, STANDSTILL, wheel_speeds)
+        seconds = self.reaction + sum(duration for duration, _ in parts) / 2.0
         v, omega = twist
         return v * seconds, omega * seconds
 
@@ -236,11 +228,6 @@ class Actuators(Checked):
     def reaction(self) -> float:
         """Time by which a stop is later than without lag and delay (s)."""
         return self.delay / NANOSECONDS + self.lag
-
-    def _deceleration_time(self, twist: Twist, wheels: Wheels | None) -> float:
-        wheel_speeds = (lambda *_: STANDSTILL) if wheels is None else wheels.wheel_speeds
-        parts = self.acceleration.transition(twist, STANDSTILL, wheel_speeds)
-        return sum(seconds for seconds, _ in parts)
 
     def reached(self, twist: Twist, wheels: Wheels) -> Twist:
         """Return the twist that the motors reach when one is demanded."""

@@ -28,24 +28,26 @@ from diffdrive_jacobian.numerics.checks import (
     instance,
     nanoseconds,
     number,
-    numbers,
+    pair,
     positive,
     read_only,
+    triple,
 )
-from diffdrive_jacobian.simulation._uncertainty import Uncertainty, moments_along
 from diffdrive_jacobian.simulation.actuators import STANDSTILL as STANDSTILL
 from diffdrive_jacobian.simulation.actuators import Drive, Speeds
-from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian, propagated_moments
-from diffdrive_jacobian.simulation.odometry_noise import spectral_densities, twist_covariance
+from diffdrive_jacobian.simulation.exact_moments import Entries, Moments, gaussian, propagated_moments
+from diffdrive_jacobian.simulation.odometry_noise import twist_covariance
+from diffdrive_jacobian.simulation.quadrature_moments import moments_along
 from diffdrive_jacobian.simulation.robot_model import RobotModel as RobotModel
-from diffdrive_jacobian.simulation.robot_model import Steady, pair
+from diffdrive_jacobian.simulation.robot_model import Steady
 from diffdrive_jacobian.simulation.slip import Truth
 from diffdrive_jacobian.simulation.speeds import Piece, Pose, Twist, arc_end, displaced
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 _CERTAIN = read_only(np.zeros((3, 3)))
-_State: TypeAlias = tuple[Pose, Speeds, Uncertainty, Truth | None]
-"""Pose, wheel angles, uncertainty and truth at a time. Truth None: the pose is the true one."""
+_State: TypeAlias = tuple[Pose, Speeds, Entries | None, Truth | None]
+"""Pose, wheel angles, moments of the error of the pose and truth at a time. Moments None: they have
+overflowed. Truth None: the pose is the true one."""
 
 
 def _field(name: str, doc: str) -> Any:
@@ -102,15 +104,41 @@ class Robot:
             commanded_at: Time at which the command took effect (ns); None: it is zero.
         """
         instance('model', model, RobotModel)
-        stamp, place = nanoseconds('stamp', stamp), _triple('pose', pose)
-        uncertainty = Uncertainty(tuple(gaussian(covariance)))
-        state = place, pair('wheel_angles', wheel_angles), uncertainty, _truth(model, place)
+        stamp, place = nanoseconds('stamp', stamp), triple('pose', pose)
+        angles, moments = pair('wheel_angles', wheel_angles), tuple(gaussian(covariance))
         commanded, applied = pair('command', command), pair('twist', twist)
         if commanded_at is not None:
             commanded_at = nanoseconds('commanded_at', commanded_at)
-        made = _robot(model, stamp, state, commanded, applied, commanded_at)
-        for name in self.__slots__:
-            setattr(self, name, getattr(made, name))
+        state = place, angles, moments, _truth(model, place)
+        self._start(model, stamp, state, commanded, applied, commanded_at)
+
+    def _start(
+        self,
+        model: RobotModel,
+        stamp: int,
+        state: _State,
+        command: Twist,
+        twist: Twist,
+        commanded_at: int | None = None,
+        drive: Drive | None = None,
+        steady: Steady | None = None,
+    ) -> Robot:
+        """Set all values, which were checked. Returns this robot."""
+        self._model, self._stamp, self._state = model, stamp, state
+        self._command, self._twist, self._commanded_at = command, twist, commanded_at
+        self._expiry = None
+        if commanded_at is not None and model.command_timeout:
+            # If the timeout was shortened, it expires now, not in the past.
+            expiry = commanded_at + model.command_timeout
+            self._expiry = expiry if expiry > stamp else stamp
+        # None: the twist is held until the next event.
+        self._drive = drive
+        # What the twist implies without a drive. None: it was not needed yet.
+        self._steady = steady
+        # The last state that was computed from this one, because often the same one is needed next; and
+        # where the last state that was computed along the drive begins (s), and the state there.
+        self._ahead = self._knot = None
+        return self
 
     def __repr__(self) -> str:
         """Return a constructor call with the values."""
@@ -170,7 +198,7 @@ class Robot:
         Raises:
             ValueError: The covariance overflows.
         """
-        xx, xy, xt, yy, yt, tt, *_ = self._state[2].moments()
+        xx, xy, xt, yy, yt, tt, *_ = self._finite_moments()
         return xx, xy, xt, xy, yy, yt, xt, yt, tt
 
     @property
@@ -180,7 +208,13 @@ class Robot:
         Raises:
             ValueError: They overflow.
         """
-        return Moments(*self._state[2].moments())
+        return Moments(*self._finite_moments())
+
+    def _finite_moments(self) -> Entries:
+        moments = self._state[2]
+        if moments is None:
+            raise ValueError('twist and time must give a finite result, but it overflows')
+        return moments
 
     @property
     def wheel_angles(self) -> Speeds:
@@ -297,9 +331,10 @@ class Robot:
         """
         here = self.at(stamp)
         _, angles, _, truth = here._state
-        placed = Robot(model=self._model, stamp=here._stamp, pose=pose, covariance=covariance)
-        place, _, uncertainty, there = placed._state
-        return here._with(here._stamp, (place, angles, uncertainty, truth if odometry_only else there))
+        place, moments = triple('pose', pose), tuple(gaussian(covariance))
+        if not odometry_only:
+            truth = _truth(self._model, place)
+        return here._with(here._stamp, (place, angles, moments, truth))
 
     def reported(self, pose: Pose, wheel_angles: Speeds, twist: Twist) -> Robot:
         """Return this robot as its sensors report it, with the same covariance and the same truth.
@@ -307,10 +342,12 @@ class Robot:
         Raises:
             ValueError: An argument has another shape or is not finite.
         """
-        _, _, uncertainty, truth = self._state
-        state = _triple('pose', pose), pair('wheel_angles', wheel_angles), uncertainty, truth
+        _, _, moments, truth = self._state
+        state = triple('pose', pose), pair('wheel_angles', wheel_angles), moments, truth
         twist = pair('twist', twist)
-        return _robot(self._model, self._stamp, state, self._command, twist, self._commanded_at)
+        return object.__new__(Robot)._start(
+            self._model, self._stamp, state, self._command, twist, self._commanded_at
+        )
 
     def pushed(self, displacement: ArrayLike, stamp: int, *, noticed: bool = False) -> Robot:
         """Displace the robot without turning its wheels, with the same command.
@@ -325,17 +362,17 @@ class Robot:
             ValueError: The displacement has another shape or is not finite, the pose overflows, the
                 model has no drift; or as `at`.
         """
-        displacement = _triple('displacement', displacement)
+        displacement = triple('displacement', displacement)
         here = self.at(stamp)
         if here._model.drift is None and not noticed:
             raise ValueError('model must have a drift: without one the odometry is the true pose')
-        moved = _triple('pose', compose(here.true_pose_tuple, displacement))
+        moved = triple('pose', compose(here.true_pose_tuple, displacement))
         if noticed:
             seen = compose(here.pose_tuple, displacement)
             here = here.placed(seen, here.covariance, here._stamp, odometry_only=True)
-        pose, angles, uncertainty, truth = here._state
+        pose, angles, moments, truth = here._state
         truth = None if truth is None else truth.moved(moved)
-        return here._with(here._stamp, (pose, angles, uncertainty, truth))
+        return here._with(here._stamp, (pose, angles, moments, truth))
 
     def remodelled(self, model: RobotModel, stamp: int, *, wheels_commanded: bool = False) -> Robot:
         """Change the model. Its limits and timeout apply to the current command.
@@ -352,12 +389,12 @@ class Robot:
         if wheels_commanded:
             command = model.twist(*self._model.wheel_speeds(*command))
         limited = model.limited(command)
-        pose, angles, uncertainty, truth = here._state
+        pose, angles, moments, truth = here._state
         if truth is None or model.drift is None:
             truth = _truth(model, pose)
         else:
             truth = truth.with_drift(model.drift)
-        state = pose, angles, uncertainty, truth
+        state = pose, angles, moments, truth
         return here._following(model, here._stamp, state, command, limited, here._commanded_at)
 
     def restarted(self, stamp: int) -> Robot:
@@ -367,14 +404,16 @@ class Robot:
             ValueError: The time is not an integer (ns).
         """
         stamp = nanoseconds('stamp', stamp)
-        pose, angles, uncertainty, truth = self._state
+        pose, angles, moments, truth = self._state
         truth = None if truth is None else truth.at_rest()
-        return _robot(self._model, stamp, (pose, angles, uncertainty, truth), STANDSTILL, STANDSTILL)
+        return object.__new__(Robot)._start(
+            self._model, stamp, (pose, angles, moments, truth), STANDSTILL, STANDSTILL
+        )
 
     def _with(self, stamp: int, state: _State) -> Robot:
         """Return the robot in another state, with the same motion."""
-        command, twist, steady = self._command, self._twist, self._steady
-        return _robot(self._model, stamp, state, command, twist, self._commanded_at, self._drive, steady)
+        motion = self._command, self._twist, self._commanded_at, self._drive, self._steady
+        return object.__new__(Robot)._start(self._model, stamp, state, *motion)
 
     def _following(
         self,
@@ -389,10 +428,10 @@ class Robot:
         actuators = model.actuators
         if actuators is None or actuators.immediate:
             twist = target if actuators is None else actuators.reached(target, model)
-            return _robot(model, stamp, state, command, twist, commanded_at)
+            return object.__new__(Robot)._start(model, stamp, state, command, twist, commanded_at)
         drive = self._drive or Drive.at(stamp, self._twist)
         drive = drive.followed(stamp, target, actuators, model)
-        return _robot(model, stamp, state, command, target, commanded_at, drive)
+        return object.__new__(Robot)._start(model, stamp, state, command, target, commanded_at, drive)
 
     def _advanced(self, stamp: int) -> tuple[int, Robot, _State]:
         """Return a time (ns), the robot after its last event before it, and the state at that time.
@@ -412,39 +451,30 @@ class Robot:
 
     def _state_at(self, stamp: int) -> _State:
         """Compute the state at a time up to the timeout."""
-        ahead = self._ahead
-        if ahead is not None and ahead[0] == stamp:
-            return ahead[1]
-        if self._drive is not None:
-            state = self._driven(self._drive, stamp)
-            self._ahead = stamp, state
-            return state
-        dt = (stamp - self._stamp) / NANOSECONDS
-        if dt == 0.0:
+        if self._ahead is not None and self._ahead[0] == stamp:
+            return self._ahead[1]
+        if stamp == self._stamp:
             return self._state
-        pose, angles, uncertainty, truth = self._state
-        twist = self._twist
+        truth, drive = self._state[3], self._drive
+        if drive is not None:
+            state = self._driven(drive, stamp)
+        elif self._twist != STANDSTILL:
+            dt = (stamp - self._stamp) / NANOSECONDS
+            state = _after_arc(self._state, self._twist, self._steady or self._find_steady(), dt)
+        else:
+            state = self._state
         if truth is not None:
             L, k = self._model.wheel_separation, self._model.wheel_travel_variance
-            truth = truth.after(self._stamp, stamp, twist, L, k)
-        if twist == STANDSTILL:
-            return pose, angles, uncertainty, truth
-        (omega_R, omega_L), densities = self._steady or self._find_steady()
-        right, left = angles = angles[0] + omega_R * dt, angles[1] + omega_L * dt
-        # A finite sum has finite terms.
-        if not (isfinite(right + left) or (isfinite(right) and isfinite(left))):
-            raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
-        uncertainty = uncertainty.after(propagated_moments, pose[2], twist, densities, dt)
-        state = arc_end(pose, twist, dt), angles, uncertainty, truth
+            if drive is not None:
+                truth = truth.along(drive.motion, self._stamp, stamp, L, k)
+            else:
+                truth = truth.after(self._stamp, stamp, self._twist, L, k)
+            state = *state[:3], truth
         self._ahead = stamp, state
         return state
 
     def _driven(self, drive: Drive, stamp: int) -> _State:
-        """Compute the state at a time up to the timeout, along a drive."""
-        model, truth = self._model, self._state[3]
-        L, k = model.wheel_separation, model.wheel_travel_variance
-        if truth is not None:
-            truth = truth.along(drive.motion, self._stamp, stamp, L, k)
+        """Compute the state at a time up to the timeout, along a drive; the truth is left out."""
         time, end = drive.motion.seconds(self._stamp), drive.motion.seconds(stamp)
         state = self._state
         if self._knot is not None and self._knot[0] <= end:
@@ -453,63 +483,36 @@ class Robot:
             if limit == end:
                 # The state may be asked for again at a later time.
                 self._knot = time, state
-            state, time = self._after(state, piece, L, k), limit
-        pose, angles, uncertainty, _ = state
-        return pose, angles, uncertainty, truth
+            state, time = self._after_step(state, piece), limit
+        return state
 
-    def _after(self, state: _State, piece: Piece, L: float, k: float) -> _State:
+    def _after_step(self, state: _State, piece: Piece) -> _State:
         """Compute the state after a step of a drive; the truth is left out."""
-        pose, (right, left), uncertainty, _ = state
-        dt = piece.seconds
+        model, dt = self._model, piece.seconds
         if piece.constant:
-            v, omega = twist = piece.twist(0.0)
-            if twist == STANDSTILL:
-                return state
-            turned = self._model.wheel_speeds(v * dt, omega * dt)
-            densities = spectral_densities(v, omega, L, k)
-            uncertainty = uncertainty.after(propagated_moments, pose[2], twist, densities, dt)
-            pose = arc_end(pose, twist, dt)
-        else:
-            _, _, path, turn = piece.state(dt)
-            turned = self._model.wheel_speeds(path, turn)
-            uncertainty = uncertainty.after(moments_along, pose[2], piece, dt, L, k)
-            pose = displaced(pose, piece.displacement(dt))
-        return pose, (right + turned[0], left + turned[1]), uncertainty, None
+            twist = piece.twist(0.0)
+            return state if twist == STANDSTILL else _after_arc(state, twist, model.steady(twist), dt)
+        pose, (right, left), moments, truth = state
+        L, k = model.wheel_separation, model.wheel_travel_variance
+        _, _, path, turn = piece.state(dt)
+        turned_R, turned_L = model.wheel_speeds(path, turn)
+        if moments is not None:
+            moments = moments_along(moments, pose[2], piece, dt, L, k)
+        pose = displaced(pose, piece.displacement(dt))
+        return pose, (right + turned_R, left + turned_L), moments, truth
 
 
-def _robot(
-    model: RobotModel,
-    stamp: int,
-    state: _State,
-    command: Twist,
-    twist: Twist,
-    commanded_at: int | None = None,
-    drive: Drive | None = None,
-    steady: Steady | None = None,
-) -> Robot:
-    """Return a robot with checked values, without checking them again for every message."""
-    robot = object.__new__(Robot)
-    robot._model, robot._stamp, robot._state = model, stamp, state
-    robot._command, robot._twist, robot._commanded_at = command, twist, commanded_at
-    robot._expiry = None
-    if commanded_at is not None and model.command_timeout:
-        # If the timeout was shortened, it expires now, not in the past.
-        expiry = commanded_at + model.command_timeout
-        robot._expiry = expiry if expiry > stamp else stamp
-    # None: the twist is held until the next event.
-    robot._drive = drive
-    # What the twist implies without a drive. None: it was not needed yet.
-    robot._steady = steady
-    # The last state that was computed from this one, because often the same one is needed next; and
-    # where the last state that was computed along the drive begins (s), and the state there.
-    robot._ahead = robot._knot = None
-    return robot
-
-
-def _triple(name: str, value: ArrayLike) -> Pose:
-    """Return three finite numbers as a tuple of floats."""
-    x, y, theta = numbers(name, value, 3)
-    return x, y, theta
+def _after_arc(state: _State, twist: Twist, steady: Steady, dt: float) -> _State:
+    """Compute the state after a time (s) with a constant twist; the truth is left out."""
+    pose, angles, moments, truth = state
+    omega_R, omega_L = steady.wheel_speeds
+    right, left = angles[0] + omega_R * dt, angles[1] + omega_L * dt
+    # A finite sum has finite terms.
+    if not (isfinite(right + left) or (isfinite(right) and isfinite(left))):
+        raise ValueError(f'wheel_angles must be finite, got {[right, left]}')
+    if moments is not None:
+        moments = propagated_moments(moments, pose[2], twist, steady.densities, dt)
+    return arc_end(pose, twist, dt), (right, left), moments, truth
 
 
 def _truth(model: RobotModel, pose: Pose) -> Truth | None:

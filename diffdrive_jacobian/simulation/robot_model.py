@@ -10,13 +10,7 @@ from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
-from diffdrive_jacobian.numerics.checks import (
-    Checked,
-    NotNegative,
-    Positive,
-    instance,
-    numbers,
-)
+from diffdrive_jacobian.numerics.checks import Checked, NotNegative, Positive, instance, pair
 from diffdrive_jacobian.simulation.actuators import Actuators, Duration, Speeds
 from diffdrive_jacobian.simulation.odometry_noise import spectral_densities
 from diffdrive_jacobian.simulation.slip import Drift
@@ -138,14 +132,3 @@ class RobotModel(Checked):
         if not (math.isfinite(v) and math.isfinite(omega)):
             raise ValueError('wheel speeds must give a finite twist, but it overflows')
         return v, omega
-
-
-def pair(name: str, value: Any) -> tuple[float, float]:
-    """Return two finite numbers as a tuple of floats."""
-    if type(value) is tuple and len(value) == 2:
-        first, second = value
-        # A finite sum has finite terms.
-        if type(first) is type(second) is float and math.isfinite(first + second):
-            return first, second
-    first, second = numbers(name, value, 2)
-    return first, second

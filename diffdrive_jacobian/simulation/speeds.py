@@ -1,5 +1,7 @@
 """Speeds that change with time: v and omega are piecewise `a + b t + c exp(-t / tau)`.
 
+A `Piece` is that of one robot, of floats, or those of many, of arrays.
+
 That is what acceleration limits and a first-order lag of the wheels make of commands. The last piece is
 constant and has no end. The pose is computed by Gauss-Legendre quadrature in equal steps of each piece,
 so that it depends on the pieces alone, not on the times at which it is computed.
@@ -11,16 +13,17 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator
 from itertools import pairwise
-from math import cos, exp, expm1, isfinite, sin, sqrt
+from math import cos, isfinite, sin, sqrt
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from diffdrive_jacobian.kinematics.se2 import integrate
-from diffdrive_jacobian.numerics.elementary import wrap
+from diffdrive_jacobian.numerics.elementary import exp, expm1, wrap
+from diffdrive_jacobian.numerics.formula import Number
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-Course: TypeAlias = tuple[float, float, float]
+Course: TypeAlias = tuple[Number, Number, Number]
 """a, b and c of a speed."""
 Pose: TypeAlias = tuple[float, float, float]
 """`(x, y, theta)` (m, m, rad)."""
@@ -54,49 +57,47 @@ class Quadrature(NamedTuple):
         return cls(tuple(map(tuple, nodes.tolist())), tuple(map(tuple, partial.tolist())))
 
 
-_QUADRATURES = (0.05, Quadrature.of(3)), (0.25, Quadrature.of(4)), (math.inf, Quadrature.of(8))
+QUADRATURES = (0.05, Quadrature.of(3)), (0.25, Quadrature.of(4)), (math.inf, Quadrature.of(8))
 """The size of a step, and the quadrature for steps of at most that size."""
 
 
-def speed_at(course: Course, t: float, tau: float) -> float:
+def speed_at(course: Course, t: Number, tau: float) -> Number:
     """Return a speed after the time t."""
     a, b, c = course
     # At the beginning it is the given speed, without rounding, also where that is zero.
-    return (a + c) + (b * t + c * expm1(-t / tau)) if c else a + b * t
+    return (a + c) + (b * t + c * expm1(-t / tau)) if tau else a + b * t
 
 
-def travelled(course: Course, t: float, tau: float) -> float:
+def travelled(course: Course, t: Number, tau: float) -> Number:
     """Return the integral of a speed over the time t."""
     a, b, c = course
-    return (a + b * t / 2.0) * t - (c * tau * expm1(-t / tau) if c else 0.0)
+    line = (a + b * t / 2.0) * t
+    return line - c * tau * expm1(-t / tau) if tau else line
 
 
 class Piece(NamedTuple):
     """A twist over a time in which each of its speeds follows one course."""
 
-    seconds: float
+    seconds: Number
     """Duration (s); the last piece: infinite."""
     v: Course
     omega: Course
-    tau: float = 1.0
-    """Time constant of the exponential function (s)."""
+    tau: float = 0.0
+    """Time constant of the exponential function (s); 0: there is none, and c is 0."""
 
     @property
     def constant(self) -> bool:
         """Whether both speeds are constant."""
         return not (any(self.v[1:]) or any(self.omega[1:]))
 
-    def twist(self, t: float) -> Twist:
+    def twist(self, t: Number) -> tuple[Number, Number]:
         """Return the twist after the time t."""
         return speed_at(self.v, t, self.tau), speed_at(self.omega, t, self.tau)
 
-    def part(self, begin: float, end: float) -> Piece:
+    def part(self, begin: Number, end: Number) -> Piece:
         """Return the piece from one time to another."""
-        if begin == 0.0:
-            return self._replace(seconds=end)
-        v, omega = (
-            (a + b * begin, b, c * exp(-begin / self.tau) if c else 0.0) for a, b, c in self[1:3]
-        )
+        decay = exp(-begin / self.tau) if self.tau else 1.0
+        v, omega = ((a + b * begin, b, c * decay) for a, b, c in (self.v, self.omega))
         return Piece(end - begin, v, omega, self.tau)
 
     def mapped(self, rows: tuple[Twist, Twist]) -> Piece:
@@ -117,13 +118,13 @@ class Piece(NamedTuple):
         return self._replace(v=(a + v, b, c), omega=(d + omega, e, f))
 
     @property
-    def step(self) -> float:
+    def step(self) -> Number:
         """Duration of the steps of the quadrature (s)."""
         if self.constant:
             return self.seconds
         a, b, c = self.omega
         steps = (abs(a) + abs(b) * self.seconds / 2.0) * self.seconds / MAX_TURN
-        if self.v[2] or c:
+        if self.tau:
             # The speed lies between that at the beginning and those that it follows. (In a short piece
             # with a large b the terms of the speed are much larger than their sum.)
             first = a + b * self.tau
@@ -132,11 +133,11 @@ class Piece(NamedTuple):
             steps = max(steps, self.seconds / self.tau / MAX_DECAY)
         return self.seconds / max(1.0, math.ceil(steps))
 
-    def state(self, t: float) -> tuple[float, float, float, float]:
+    def state(self, t: Number) -> tuple[Number, Number, Number, Number]:
         """Return the twist after the time t, and the path and the turn until then."""
         (a, b, c), (d, e, f), tau = self.v, self.omega, self.tau
         path, turn = (a + b * t / 2.0) * t, (d + e * t / 2.0) * t
-        if c or f:
+        if tau:
             loss = expm1(-t / tau)
             v, omega = (a + c) + (b * t + c * loss), (d + f) + (e * t + f * loss)
             path, turn = path - c * tau * loss, turn - f * tau * loss
@@ -145,12 +146,12 @@ class Piece(NamedTuple):
 
     def quadrature(self, t: float) -> Quadrature:
         """Return the quadrature that is exact to 1e-14 over the time t, at most a step."""
-        (_, _, c), (d, e, f) = self.v, self.omega
+        d, e, f = self.omega
         # An order n of the derivative of exp(i e t^2 / 2) has up to n!! times sqrt(e)^n.
         size = (abs(d) + abs(f) + 1.8 * sqrt(abs(e))) * t
-        if c or f:
+        if self.tau:
             size = max(size, t / self.tau)
-        return next(quadrature for most, quadrature in _QUADRATURES if size <= most)
+        return next(quadrature for most, quadrature in QUADRATURES if size <= most)
 
     def displacement(self, t: float) -> Pose:
         """Compute `(dx, dy, dtheta)` in the body frame of the beginning, after at most a step."""
@@ -280,7 +281,7 @@ def rolled(course: Course, piece: Piece, seconds: float) -> float:
     """Return the integral of the absolute value of a speed of a piece over a time (s)."""
     times = [0.0, *sign_changes(course, seconds, piece.tau), seconds]
     places = [travelled(course, time, piece.tau) for time in times]
-    return sum(abs(end - begin) for begin, end in pairwise(places))
+    return float(sum(abs(end - begin) for begin, end in pairwise(places)))
 
 
 def arc_end(pose: Pose, twist: Twist, dt: float) -> Pose:

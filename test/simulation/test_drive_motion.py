@@ -10,7 +10,7 @@ import pytest
 
 from diffdrive_jacobian.control import VelocityLimits
 from diffdrive_jacobian.faults.robot import ActuatorLag
-from diffdrive_jacobian.simulation import Robot, RobotModel, _uncertainty
+from diffdrive_jacobian.simulation import Robot, RobotModel, quadrature_moments
 from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 from diffdrive_jacobian.simulation.slip import Drift
 from diffdrive_jacobian.simulation.speeds import Piece, Profile
@@ -307,8 +307,8 @@ def test_steps_progress_also_where_they_are_shorter_than_the_resolution_of_times
 def test_a_heading_that_is_lost_at_once_takes_no_more_steps(monkeypatch):
     """The noise of wheels that are a tenth of a millimetre apart needs 8 million steps in a second."""
     steps = []
-    after = _uncertainty._after
-    monkeypatch.setattr(_uncertainty, '_after', lambda *step: steps.append(step) or after(*step))
+    after = quadrature_moments._after
+    monkeypatch.setattr(quadrature_moments, '_after', lambda *step: steps.append(step) or after(*step))
     wheels = RobotModel(wheel_separation=1e-4, wheel_travel_variance=1.0, actuators=Actuators(lag=0.1))
     robot = Robot(model=wheels, stamp=0, pose=(0.0, 0.0, 0.0)).commanded((0.2, 0.0), 0).at(SECOND)
     x = robot.pose_tuple[0]

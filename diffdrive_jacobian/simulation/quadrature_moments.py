@@ -1,7 +1,7 @@
-"""The uncertainty of a robot's pose along its path, computed when it is first needed.
+"""Exact moments of the error of odometry along motions whose speeds change, by quadrature.
 
-Along motions whose speeds change, with the heading `z = exp(i theta)` since the start, `m(t)` half the
-variance of the error psi of the heading, and `u = exp(i psi)`, the error gamma of the position obeys
+With the heading `z = exp(i theta)` since the start, `m(t)` half the variance of the error psi of the
+heading, and `u = exp(i psi)`, the error gamma of the position obeys
 
     d gamma = z ((v + i vw/2) u - v) dt + z u dB_v
 
@@ -12,11 +12,9 @@ changes its direction. Source: doc/mathematics.md, "Acceleration, lag and delay"
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from itertools import pairwise
 from math import cos, exp, expm1, isfinite, sin
 from operator import mul
-from typing import Any, TypeAlias
 
 from diffdrive_jacobian.simulation.exact_moments import (
     Entries,
@@ -144,60 +142,3 @@ def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> 
     cosine, sine = cos(theta), sin(theta)
     g = complex(cosine, sine) * displacement * T
     return composed(moments, cosine, sine, g.real, g.imag, m, central(noise, m) if m else None)
-
-
-Propagation: TypeAlias = Callable[..., Entries | None]
-"""`propagated_moments` or `moments_along`."""
-MAX_PENDING = 64
-"""Number of arcs that are kept at most. One more evaluates those before it, so memory is bounded."""
-
-
-class Uncertainty:
-    """Moments of the error of a pose, given or pending. An immutable value to its users."""
-
-    __slots__ = ('_moments', '_number', '_pending')
-
-    def __init__(self, moments: Entries) -> None:
-        """Start from given moments."""
-        self._moments: Entries | None = moments
-        self._pending: tuple[Uncertainty, Propagation, tuple[Any, ...]] | None = None
-        self._number = 0
-
-    def after(self, propagated: Propagation, *arc: Any) -> Uncertainty:
-        """Return the uncertainty at the end of an arc, without evaluating it.
-
-        Args:
-            propagated: Returns the moments at the end of an arc.
-            arc: Its arguments after the moments at the start.
-        """
-        if self._number >= MAX_PENDING:
-            self._evaluate()
-        later = object.__new__(Uncertainty)
-        later._moments = None
-        later._pending = self, propagated, arc
-        later._number = self._number + 1
-        return later
-
-    def moments(self) -> Entries:
-        """Return the entries of the moments; ValueError if they overflow."""
-        if self._moments is None:
-            self._evaluate()
-            if self._moments is None:
-                raise ValueError('twist and time must give a finite result, but it overflows')
-        return self._moments
-
-    def _evaluate(self) -> None:
-        """Evaluate the pending arcs in their order. Several threads may do so at once."""
-        waiting = []
-        here, pending = self, self._pending
-        while pending is not None:
-            waiting.append((here, pending))
-            here = pending[0]
-            pending = here._pending
-        for here, (before, propagated, arc) in reversed(waiting):
-            if before._moments is not None:
-                # After an overflow there is none.
-                here._moments = propagated(before._moments, *arc)
-            here._number = 0
-            # Last, because then the moments count.
-            here._pending = None
