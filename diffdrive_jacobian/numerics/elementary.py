@@ -93,6 +93,11 @@ def expm1(x: Any) -> Any:
     return math.expm1(x) if type(x) is float else np.expm1(x)
 
 
+def ceil(x: Any) -> Any:
+    """The smallest whole number that is not below x."""
+    return float(math.ceil(x)) if type(x) is float else np.ceil(x)
+
+
 def maximum(*values: Any) -> Any:
     """The largest one."""
     return max(values) if _are_floats(values) else functools.reduce(np.maximum, values)

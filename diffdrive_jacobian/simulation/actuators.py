@@ -26,13 +26,12 @@ from diffdrive_jacobian.numerics.checks import (
     positive,
 )
 from diffdrive_jacobian.numerics.elementary import maximum, minimum, where
-from diffdrive_jacobian.numerics.formula import Number
+from diffdrive_jacobian.numerics.formula import Number, Vector
 from diffdrive_jacobian.simulation.speeds import Piece, Profile, Twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 SHORTEST = 1e-9
 """Shortest duration of a part of a transition, the resolution of times (s)."""
-NumberPair: TypeAlias = tuple[Number, Number]
 Speeds: TypeAlias = tuple[float, float]
 """`(omega_R, omega_L)` (rad/s)."""
 
@@ -88,8 +87,8 @@ class AccelerationLimits(Checked):
         return self.v.unlimited and self.omega.unlimited and self.max_wheel_acceleration == math.inf
 
     def transition(
-        self, start: NumberPair, target: NumberPair, wheel_speeds: Callable[[Number, Number], NumberPair]
-    ) -> Iterator[tuple[Number, NumberPair]]:
+        self, start: Vector, target: Vector, wheel_speeds: Callable[[Number, Number], Vector]
+    ) -> Iterator[tuple[Number, Vector]]:
         """Yield the parts of the fastest transition along the straight line from one twist to another.
 
         `wheel_speeds` maps a twist to the wheel speeds (rad/s), linearly. Twists are those of one robot,

@@ -19,8 +19,8 @@ from diffdrive_jacobian.control.controller import Controller, Law
 from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import function
-from diffdrive_jacobian.simulation._block import Array, Batch, Block, Keep, Outcomes, Rows
 from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.rollout import Array, Keep, Loops, Outcomes, Rollout, Rows
 
 BLOCK = 8192
 """Number of robots that are advanced together; their states fit into the processor's cache."""
@@ -91,14 +91,25 @@ def closed_loops(
         ValueError: An argument has a wrong shape or value, the law returns something invalid, or an
             outcome overflows.
     """
-    batch = Batch(
-        law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L, actuators
+    loops = Loops(
+        law=law,  # type: ignore[arg-type]
+        starts=starts,
+        goals=goals,
+        gains=gains,
+        rate=rate,
+        duration=duration,
+        arrival=Arrival() if arrival is None else arrival,
+        turning_gain=turning_gain,
+        limits=limits,
+        r=r,
+        L=L,
+        actuators=actuators,
     )
     if progress is not None:
         function('progress', progress)
     if on_step is not None:
         function('on_step', on_step)
-    return _drive(batch, None, progress, on_step)
+    return _drive(loops, None, progress, on_step)
 
 
 def trajectories(
@@ -119,17 +130,28 @@ def trajectories(
 
     Arguments and errors are those of `closed_loops`.
     """
-    batch = Batch(
-        law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L, actuators
+    loops = Loops(
+        law=law,  # type: ignore[arg-type]
+        starts=starts,
+        goals=goals,
+        gains=gains,
+        rate=rate,
+        duration=duration,
+        arrival=Arrival() if arrival is None else arrival,
+        turning_gain=turning_gain,
+        limits=limits,
+        r=r,
+        L=L,
+        actuators=actuators,
     )
-    count = len(batch.starts)
-    if (batch.steps + 1) * count > MAX_SAMPLES:
+    count = loops.starts.shape[1]
+    if (loops.steps + 1) * count > MAX_SAMPLES:
         raise ValueError(
             f'duration must be shorter, because at most {MAX_SAMPLES:g} samples are kept, '
             f'got {duration:g} with {count} robots'
         )
-    poses = np.empty((batch.steps + 1, count, 3))
-    twists = np.zeros((batch.steps, count, 2))
+    poses = np.empty((loops.steps + 1, count, 3))
+    twists = np.zeros((loops.steps, count, 2))
     last = np.zeros(count, dtype=np.intp)
 
     def keep(step: int, rows: Rows, at: Array, v: Any, omega: Any) -> None:
@@ -137,33 +159,33 @@ def trajectories(
         if v is not None:
             twists[step, rows, 0], twists[step, rows, 1] = v, omega
 
-    outcomes = _drive(batch, keep)
+    outcomes = _drive(loops, keep)
     steps = int(max(last, default=0))
     held = np.minimum(np.arange(steps + 1)[:, np.newaxis], last)
     poses = poses[held, np.arange(count)]
     return Trajectories(
         np.arange(steps + 1) / rate,
-        poses.reshape(steps + 1, *batch.shape, 3),
-        twists[:steps].reshape(steps, *batch.shape, 2),
+        poses.reshape(steps + 1, *loops.shape, 3),
+        twists[:steps].reshape(steps, *loops.shape, 2),
         outcomes,
     )
 
 
 def _drive(
-    batch: Batch,
+    loops: Loops,
     keep: Keep | None,
     progress: Callable[[int], object] | None = None,
     on_step: Callable[[int], object] | None = None,
 ) -> Outcomes:
     """Drive a batch block by block and return its outcomes."""
-    if batch.equation is not None:
+    if hasattr(loops.law.law, 'formula'):
         # The law checks its arguments, the equation does not.
         try:
-            state = {'state': np.array(batch.state), 'dt': 0.0} if batch.state else {}
-            batch.law(batch.starts, batch.goals, *batch.gains, **state)
+            state = {'state': np.array(loops.law.state), 'dt': 0.0} if loops.law.state else {}
+            loops.law.law(loops.starts.T, loops.goals.T, *loops.gains, **state)
         except ValueError as error:
             raise ValueError(f'law rejects the starts, goals and gains: {error}') from error
-    count = len(batch.starts)
+    count = loops.starts.shape[1]
     found = Outcomes(
         np.zeros(count, dtype=np.bool_),
         np.full(count, np.nan),
@@ -176,10 +198,10 @@ def _drive(
     at_step = None if on_step is None else lambda: on_step(done)
     for begin in range(0, count, BLOCK):
         rows = np.arange(begin, min(begin + BLOCK, count))
-        for finished, values in Block(batch.some(rows), rows).drive(keep, at_step):
+        for finished, values in Rollout(loops, rows).drive(keep, at_step):
             for field, value in zip(found, values, strict=True):
                 field[finished] = value
             done += len(finished)
             if progress is not None:
                 progress(done)
-    return Outcomes._make(field.reshape((*batch.shape, *field.shape[1:])) for field in found)
+    return Outcomes._make(field.reshape((*loops.shape, *field.shape[1:])) for field in found)

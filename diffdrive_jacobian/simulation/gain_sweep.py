@@ -31,7 +31,7 @@ from diffdrive_jacobian.numerics.checks import (
     short,
 )
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
-from diffdrive_jacobian.simulation._block import LOST, Outcomes
+from diffdrive_jacobian.simulation.rollout import LOST, Outcomes
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from diffdrive_jacobian.kinematics.se2 import integrate
-from diffdrive_jacobian.numerics.elementary import exp, expm1, wrap
+from diffdrive_jacobian.numerics.elementary import ceil, exp, expm1, maximum, wrap
 from diffdrive_jacobian.numerics.formula import Number
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -118,20 +118,23 @@ class Piece(NamedTuple):
         return self._replace(v=(a + v, b, c), omega=(d + omega, e, f))
 
     @property
-    def step(self) -> Number:
+    def step(self) -> float:
         """Duration of the steps of the quadrature (s)."""
-        if self.constant:
-            return self.seconds
+        return float(self.seconds if self.constant else self.seconds / self.steps)
+
+    @property
+    def steps(self) -> Number:
+        """Number of steps of the quadrature."""
         a, b, c = self.omega
         steps = (abs(a) + abs(b) * self.seconds / 2.0) * self.seconds / MAX_TURN
         if self.tau:
             # The speed lies between that at the beginning and those that it follows. (In a short piece
             # with a large b the terms of the speed are much larger than their sum.)
             first = a + b * self.tau
-            fastest = max(abs(a + c), abs(first), abs(first + b * self.seconds))
+            fastest = maximum(abs(a + c), abs(first), abs(first + b * self.seconds))
             steps = fastest * self.seconds / MAX_TURN
-            steps = max(steps, self.seconds / self.tau / MAX_DECAY)
-        return self.seconds / max(1.0, math.ceil(steps))
+            steps = maximum(steps, self.seconds / self.tau / MAX_DECAY)
+        return maximum(1.0, ceil(steps))
 
     def state(self, t: Number) -> tuple[Number, Number, Number, Number]:
         """Return the twist after the time t, and the path and the turn until then."""

@@ -23,8 +23,8 @@ LIMITS = {
     'lockstep': {'calls': 116, 'functions': 80, 'files': 26},
     # The same on the executor of their programs; only functions of the package are counted.
     'executor': {'calls': 89, 'functions': 63, 'files': 21},
-    # One step of a batch of 100 closed loops.
-    'batch': {'calls': 83, 'functions': 21, 'files': 6},
+    # One step of a batch of 100 closed loops, with the equations of one robot on arrays.
+    'batch': {'calls': 88, 'functions': 26, 'files': 7},
     # The start of a program: modules of the package, and all. A ROS installation may have fewer.
     'virtual_robot': {'own modules': 56, 'modules': 500},
     'go_to_goal': {'own modules': 71, 'modules': 500},

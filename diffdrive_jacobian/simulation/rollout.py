@@ -1,0 +1,398 @@
+"""Rollouts: closed loops of many robots, which are advanced together as arrays of their coordinates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from copy import copy
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.control.controller import Controller
+from diffdrive_jacobian.control.controllers import ControllerError, find_controller
+from diffdrive_jacobian.control.goal_laws import LARGEST_TURN, without_whole_turns
+from diffdrive_jacobian.control.waypoints import Arrival, distance_to_goal
+from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
+from diffdrive_jacobian.kinematics.se2 import compose, integrate
+from diffdrive_jacobian.numerics.checks import (
+    Checked,
+    Positive,
+    array,
+    floats,
+    function,
+    instance,
+    leading,
+    positive,
+)
+from diffdrive_jacobian.numerics.elementary import dot, hypot, wrap
+from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.batch_actuators import Follower
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.intp]
+
+MAX_STEPS = 1e12
+"""Largest number of samples of a loop."""
+LOST = 1e6
+"""A robot is given up when its distance to the goal has grown by this much (m)."""
+SHRINK = 0.94
+"""When less than this share of the robots still drives, the others are removed from the arrays [-]."""
+
+
+class Outcomes(NamedTuple):
+    """Outcome of each robot; every field has the shape of the batch.
+
+    Attributes:
+        arrived: Whether it arrived in time.
+        time: Time of arrival; NaN: it did not arrive (s). Robots that take time to stop roll on.
+        path_length: Length of the path of the axle centre, forwards and backwards (m).
+        control_cost: Integral of the squares of both wheel speeds over time (rad^2/s).
+        overshoot: Largest distance beyond the goal, along the line from start to goal (m).
+        pose: Last pose, at rest if it arrived, shape (..., 3).
+    """
+
+    arrived: Mask
+    time: Array
+    path_length: Array
+    control_cost: Array
+    overshoot: Array
+    pose: Array
+
+
+def _controller(name: str, value: Any) -> Controller:
+    """Return the controller that is given, or named, or that of a law."""
+    if isinstance(value, str):
+        try:
+            return find_controller(value)
+        except ControllerError as error:
+            raise ValueError(f'{name}: {error}') from None
+    if isinstance(value, Controller):
+        return value
+    law = function(name, value, 'a function, a Controller, or the name of one')
+    return Controller(name='law', law=law)
+
+
+def _actuators(name: str, value: Any) -> Actuators | None:
+    """Require actuators whose motors are fast enough; None: commands are followed at once."""
+    if value is None:
+        return None
+    actuators: Actuators = instance(name, value, Actuators)
+    if min(actuators.max_right_speed, actuators.max_left_speed) < math.inf:
+        raise ValueError(
+            f'{name} must have no max_right_speed or max_left_speed: in batches no motor saturates'
+        )
+    return None if actuators.immediate else actuators
+
+
+@dataclass(kw_only=True, eq=False)
+class Loops(Checked):
+    """The arguments of `closed_loops`, checked, with the robots of the batch in one axis."""
+
+    law: Annotated[Controller, _controller]
+    starts: Any
+    goals: Any
+    gains: tuple[Any, ...]
+    rate: Positive
+    duration: Positive
+    arrival: Arrival
+    turning_gain: Any
+    limits: VelocityLimits
+    r: Any
+    L: Any
+    actuators: Annotated[Actuators | None, _actuators]
+    shape: tuple[int, ...] = field(init=False)
+    """The shape of the batch."""
+    columns: dict[str, Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        super().__post_init__()
+        starts, goals = array('starts', self.starts, 3), array('goals', self.goals, 'm')
+        size = goals.shape[-1]
+        if size not in (2, 3) or (self.arrival.use_heading and size != 3):
+            wanted = '(..., 3)' if self.arrival.use_heading else '(..., 2) or (..., 3)'
+            raise ValueError(f'goals must have shape {wanted}, got {goals.shape}')
+        if not self.duration * self.rate < MAX_STEPS:
+            raise ValueError(
+                f'duration must be below {MAX_STEPS / self.rate:g} s at that rate, got {self.duration:g}'
+            )
+        columns = {
+            **{f'gain {index}': array(f'gain {index}', one) for index, one in enumerate(self.gains)},
+            'turning_gain': array('turning_gain', self.turning_gain),
+            'offset': floats('offset', self.arrival.offset),
+            'r': positive('r', floats('r', self.r)),
+            'L': positive('L', floats('L', self.L)),
+            **{
+                name: floats(name, limit)
+                for name, limit in zip(self.limits.names(), self.limits.all(), strict=True)
+            },
+        }
+        shapes = {name: value.shape for name, value in columns.items()}
+        self.shape = shape = leading(starts=starts.shape[:-1], goals=goals.shape[:-1], **shapes)
+        flat = {
+            name: np.broadcast_to(value, shape).reshape(-1) if value.ndim else float(value)
+            for name, value in columns.items()
+        }
+        flat['starts'] = np.broadcast_to(starts, (*shape, 3)).reshape(-1, 3).T
+        flat['goals'] = np.broadcast_to(goals, (*shape, size)).reshape(-1, size).T
+        self._take(flat)
+
+    def _take(self, columns: dict[str, Any]) -> None:
+        """Set what may differ between robots: with the robots in the last axis, or a number for all."""
+        self.columns = columns
+        self.gains = tuple(value for name, value in columns.items() if name.startswith('gain '))
+        for name in ('starts', 'goals', 'turning_gain', 'r', 'L'):
+            setattr(self, name, columns[name])
+        self.arrival = replace(self.arrival, offset=columns['offset'])
+        self.limits = VelocityLimits(**{name: columns[name] for name in self.limits.names()})
+
+    def some(self, rows: Any) -> Loops:
+        """Return the loops of some of the robots, each coordinate contiguous in memory."""
+        loops = copy(self)
+        loops._take(
+            {
+                name: one if isinstance(one, float) else one[..., rows].copy()
+                for name, one in self.columns.items()
+            }
+        )
+        return loops
+
+    @property
+    def steps(self) -> int:
+        """Number of samples after the first."""
+        return math.ceil(self.duration * self.rate - 1e-9)
+
+
+Keep = Callable[[int, Rows, Array, Any, Any], None]
+"""Receives step, rows, poses (k, 3), v (k,) and omega (k,); the last two are None at the end."""
+
+
+@dataclass
+class Robots:
+    """The robots that still drive: what is known of each, in arrays whose last axis is the robots."""
+
+    rows: Rows
+    """Their indices in the batch."""
+    pose: Array
+    """`[x, y, theta]`, shape (3, n)."""
+    twist: Array
+    """v and omega of the odometry, shape (2, n)."""
+    memory: Array
+    """What the law remembers, shape (m, n)."""
+    open: Mask
+    """Which are not finished."""
+    turning: Mask
+    """Which turn in place at their goals."""
+    stopping: Mask
+    """Which stop at their goals before they may count as arrived."""
+    time: Array
+    """Times of arrival; NaN before (s)."""
+    sums: Array
+    """Sums of |v|, v^2 and omega^2 over the samples, shape (3, n)."""
+    beyond: Array
+    """Largest distance beyond the goal (m)."""
+    along: Array
+    """Unit vectors from start to goal, shape (2, n)."""
+    too_far: Array
+    """Distance from the goal at which a robot is given up (m)."""
+
+    @classmethod
+    def at_starts(cls, loops: Loops, rows: Rows) -> Robots:
+        """Return the robots of some loops at rest at their starts."""
+        count = len(rows)
+        with np.errstate(over='ignore', invalid='ignore'):
+            line = loops.goals[:2] - loops.starts[:2]
+            length = hypot(*line)
+            along = line / np.where(length > 0.0, length, 1.0)
+        return cls(
+            rows=rows,
+            pose=np.array([*loops.starts[:2], wrap(loops.starts[2])]),
+            twist=np.zeros((2, count)),
+            memory=np.repeat(np.array(loops.law.state)[:, np.newaxis], count, axis=1),
+            open=np.ones(count, dtype=np.bool_),
+            turning=np.zeros(count, dtype=np.bool_),
+            stopping=np.zeros(count, dtype=np.bool_),
+            time=np.full(count, np.nan),
+            sums=np.zeros((3, count)),
+            beyond=np.zeros(count),
+            along=along,
+            too_far=length + LOST,
+        )
+
+    def some(self, rows: Rows) -> Robots:
+        """Return some of the robots."""
+        return Robots(**{name: values[..., rows] for name, values in vars(self).items()})
+
+
+class Rollout:
+    """Some of the loops of a batch, advanced from sample to sample."""
+
+    def __init__(self, loops: Loops, rows: Rows) -> None:
+        """Place the robots of these rows of the batch at their starts."""
+        self.loops = loops = loops.some(rows)
+        self.robots = Robots.at_starts(loops, rows)
+        self.follower: Follower | None = None
+        if loops.actuators is not None:
+            self.follower = Follower(loops.actuators, len(rows), loops.rate)
+
+    def drive(
+        self, keep: Keep | None, on_step: Callable[[], object] | None = None
+    ) -> Iterator[tuple[Rows, Outcomes]]:
+        """Drive the robots until each has arrived or is given up; yield finished rows and outcomes.
+
+        `keep` is called with every sample of every robot, `on_step` at the beginning of every step.
+        """
+        loops = self.loops
+        for step in range(loops.steps + 1):
+            if on_step is not None:
+                on_step()
+            robots = self.robots
+            arrived, lost = self._check_ends()
+            if arrived.any():
+                robots.time = np.where(arrived & np.isnan(robots.time), step / loops.rate, robots.time)
+            if self.follower is not None:
+                arrived = np.isfinite(robots.time) & self.follower.at_rest()
+            ended = (arrived | lost) & robots.open if step < loops.steps else robots.open
+            if ended.any():
+                yield self._outcomes(ended)
+                robots.open = robots.open & ~ended
+            left = np.count_nonzero(robots.open)
+            v, omega = self._command(step) if left else (None, None)
+            if keep is not None:
+                keep(step, robots.rows[ended], robots.pose[:, ended].T, None, None)
+                if v is not None and omega is not None:
+                    going = robots.open
+                    keep(step, robots.rows[going], robots.pose[:, going].T, v[going], omega[going])
+            if v is None or omega is None:
+                return
+            if left < SHRINK * len(robots.rows):
+                still = np.flatnonzero(robots.open)
+                self.loops, self.robots = self.loops.some(still), robots.some(still)
+                v, omega = v[still], omega[still]
+                if self.follower is not None:
+                    self.follower.shrink(still)
+            # Overflow is detected in the outcomes.
+            with np.errstate(over='ignore', invalid='ignore'):
+                self._advance(v, omega)
+
+    def _check_ends(self) -> tuple[Mask, Mask]:
+        """Return which robots have arrived, and which were driven away by their law."""
+        robots, arrival, goal = self.robots, self.loops.arrival, self.loops.goals
+        x, y, theta = robots.pose
+        with np.errstate(over='ignore', invalid='ignore'):
+            dx, dy = goal[0] - x, goal[1] - y
+            robots.beyond = np.maximum(robots.beyond, -dot(robots.along, (dx, dy)))
+            distance = hypot(dx, dy)
+            if np.any(arrival.offset):
+                distance = distance_to_goal.formula(x, y, theta, *goal[:2], arrival.offset)
+        there = near = distance <= arrival.xy_tolerance
+        stopped = arrival.stopped(*robots.twist) if arrival.must_stop else np.True_
+        if arrival.use_heading:
+            robots.turning |= near & stopped
+            there = robots.turning & (abs(wrap(goal[2] - theta)) <= arrival.yaw_tolerance)
+        if arrival.must_stop:
+            robots.stopping = (there | near & ~robots.turning) & ~stopped
+            there = there & stopped
+        return there, distance > robots.too_far
+
+    def _command(self, step: int) -> tuple[Array, Array]:
+        """Evaluate the law, and limit its twists."""
+        loops, robots, (count,) = self.loops, self.robots, self.robots.rows.shape
+        twist, memory = self._evaluate(step), len(robots.memory)
+        try:
+            if memory:
+                *twist, state = twist
+                robots.memory = np.broadcast_to(floats('law', state), (count, memory)).T
+            v, omega = (np.broadcast_to(floats('law', part), count) for part in twist)
+        except (TypeError, ValueError) as error:
+            state_too = f' and the state of shape {(count, memory)}' if memory else ''
+            raise ValueError(
+                f'law must return (v, omega), each of shape () or {(count,)}{state_too}, '
+                f'got {twist!r:.80}'
+            ) from error
+        if loops.arrival.use_heading and robots.turning.any():
+            turn = wrap(loops.goals[2] - robots.pose[2])
+            v = np.where(robots.turning, 0.0, v)
+            omega = np.where(robots.turning, loops.turning_gain * turn, omega)
+        driven = robots.open & np.isnan(robots.time) & ~robots.stopping
+        if not driven.all():
+            # Finished robots stand still, whatever their law returns.
+            v, omega = np.where(driven, v, 0.0), np.where(driven, omega, 0.0)
+        finite = np.isfinite(v) & np.isfinite(omega)
+        if not finite.all():
+            row = int(np.argmin(finite))
+            raise ValueError(
+                f'law must return finite (v, omega), got ({v[row]}, {omega[row]}) '
+                f'at pose {robots.pose[:, row].tolist()}'
+            )
+        v, omega = self._limited(v, omega)
+        if np.abs(omega).max() > LARGEST_TURN * loops.rate:
+            # The other direction may be forbidden.
+            v, omega = self._limited(v, without_whole_turns(omega, loops.rate))
+        return v, omega
+
+    def _evaluate(self, step: int) -> Any:
+        """Return what the law returns: an equation of components, or a function of arrays of poses."""
+        loops, robots = self.loops, self.robots
+        law, more = loops.law.law, {}
+        equation = getattr(law, 'formula', None)
+        if len(robots.memory):
+            more = {'state': robots.memory if equation else robots.memory.T}
+            more['dt'] = 1.0 / loops.rate if step else 0.0
+        if equation is None:
+            return law(robots.pose.T, loops.goals.T, *loops.gains, **more)
+        found = equation(robots.pose, loops.goals, *loops.gains, **more)
+        if not more:
+            return found
+        v, omega, state = found
+        return v, omega, np.array(np.broadcast_arrays(robots.pose[0], *state)[1:]).T
+
+    def _limited(self, v: Array, omega: Array) -> tuple[Array, Array]:
+        """Scale twists to the velocity limits."""
+        loops = self.loops
+        if loops.limits.unlimited:
+            return v, omega
+        with np.errstate(all='ignore'):
+            limited: tuple[Array, Array] = scaled_to_limits.formula(
+                v, omega, *loops.limits.all(), loops.r, loops.L
+            )
+        return limited
+
+    def _advance(self, v: Array, omega: Array) -> None:
+        """Apply a constant twist until the next sample, or let robots that take time follow it."""
+        loops, robots = self.loops, self.robots
+        if self.follower is None:
+            robots.twist = np.array([v, omega])
+            robots.sums += np.abs(v), v * v, omega * omega
+            robots.pose = np.array(integrate.formula(robots.pose, (v, omega), 1.0 / loops.rate))
+            return
+
+        def wheel_speeds(v: Array, omega: Array) -> Any:
+            return body_to_wheel.formula(v, omega, loops.r, loops.L)
+
+        for rows, displacement, sums in self.follower.advance(wheel_speeds, np.array([v, omega])):
+            robots.pose[:, rows] = compose.formula(robots.pose[:, rows], displacement)
+            robots.sums[:, rows] += sums * loops.rate
+        robots.twist = self.follower.twist
+
+    def _outcomes(self, done: Mask) -> tuple[Rows, Outcomes]:
+        """Return the rows and the outcomes of the robots that are finished."""
+        loops, robots = self.loops.some(done), self.robots.some(np.flatnonzero(done))
+        with np.errstate(all='ignore'):
+            path, squares_v, squares_omega = robots.sums / loops.rate
+            # Both wheels: (v + omega L/2)^2 + (v - omega L/2)^2, over r^2.
+            r, L = np.asarray(loops.r), np.asarray(loops.L)
+            control_cost = 2.0 * (squares_v + squares_omega * (L / 2.0) ** 2) / r**2
+        arrived = np.isfinite(robots.time)
+        outcomes = Outcomes(arrived, robots.time, path, control_cost, robots.beyond, robots.pose.T)
+        if not all(np.isfinite(values).all() for values in outcomes[2:]):
+            raise ValueError(
+                'starts, goals, gains, rate, limits, r and L must give finite outcomes, '
+                'but they overflow'
+            )
+        return robots.rows, outcomes
