@@ -27,6 +27,7 @@ from diffdrive_jacobian.numerics.checks import (
 )
 from diffdrive_jacobian.numerics.elementary import maximum, minimum, where
 from diffdrive_jacobian.numerics.formula import Number, Vector
+from diffdrive_jacobian.simulation.speeds import STANDSTILL as STANDSTILL
 from diffdrive_jacobian.simulation.speeds import Piece, Profile, Twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -129,8 +130,6 @@ def _zero(speed: Number, change: Number) -> Number:
 
 SETTLING = 36.0
 """Time constants after which a lagging wheel has reached its speed: exp(-36) is 2e-16."""
-
-STANDSTILL = (0.0, 0.0)
 
 
 class Wheels(Protocol):

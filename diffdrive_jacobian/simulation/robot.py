@@ -41,7 +41,7 @@ from diffdrive_jacobian.simulation.quadrature_moments import moments_along
 from diffdrive_jacobian.simulation.robot_model import RobotModel as RobotModel
 from diffdrive_jacobian.simulation.robot_model import Steady
 from diffdrive_jacobian.simulation.slip import Truth
-from diffdrive_jacobian.simulation.speeds import Piece, Pose, Twist, arc_end, displaced
+from diffdrive_jacobian.simulation.speeds import Piece, Pose, Profile, Twist, arc_end, displaced
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 _CERTAIN = read_only(np.zeros((3, 3)))
@@ -133,6 +133,8 @@ class Robot:
             self._expiry = expiry if expiry > stamp else stamp
         # None: the twist is held until the next event.
         self._drive = drive
+        if drive is None and model.drift is not None:
+            self._drive = Drive.at(stamp, twist)
         # What the twist implies without a drive. None: it was not needed yet.
         self._steady = steady
         # The last state that was computed from this one, because often the same one is needed next; and
@@ -248,12 +250,10 @@ class Robot:
     def true_twist(self) -> Twist:
         """The true twist `(v, omega)` from this time on, the slip included (m/s, rad/s)."""
         truth, drive = self._state[3], self._drive
-        if truth is None:
+        if truth is None or drive is None:
             return self.twist
         L, k = self._model.wheel_separation, self._model.wheel_travel_variance
-        if drive is None:
-            return truth.twist(self._stamp, self._twist, L, k)
-        return truth.twist_along(drive.motion, self._stamp, L, k)
+        return truth.twist(drive.motion, self._stamp, L, k)
 
     @property
     def wheel_speeds(self) -> Speeds:
@@ -428,7 +428,10 @@ class Robot:
         actuators = model.actuators
         if actuators is None or actuators.immediate:
             twist = target if actuators is None else actuators.reached(target, model)
-            return object.__new__(Robot)._start(model, stamp, state, command, twist, commanded_at)
+            drive = self._drive
+            if drive is not None and not (model.drift and drive.motion.holds(twist, stamp)):
+                drive = None
+            return object.__new__(Robot)._start(model, stamp, state, command, twist, commanded_at, drive)
         drive = self._drive or Drive.at(stamp, self._twist)
         drive = drive.followed(stamp, target, actuators, model)
         return object.__new__(Robot)._start(model, stamp, state, command, target, commanded_at, drive)
@@ -455,36 +458,32 @@ class Robot:
             return self._ahead[1]
         if stamp == self._stamp:
             return self._state
-        truth, drive = self._state[3], self._drive
-        if drive is not None:
-            state = self._driven(drive, stamp)
+        if self._drive is not None:
+            state = self._driven(self._drive.motion, stamp)
         elif self._twist != STANDSTILL:
             dt = (stamp - self._stamp) / NANOSECONDS
             state = _after_arc(self._state, self._twist, self._steady or self._find_steady(), dt)
         else:
             state = self._state
-        if truth is not None:
-            L, k = self._model.wheel_separation, self._model.wheel_travel_variance
-            if drive is not None:
-                truth = truth.along(drive.motion, self._stamp, stamp, L, k)
-            else:
-                truth = truth.after(self._stamp, stamp, self._twist, L, k)
-            state = *state[:3], truth
         self._ahead = stamp, state
         return state
 
-    def _driven(self, drive: Drive, stamp: int) -> _State:
-        """Compute the state at a time up to the timeout, along a drive; the truth is left out."""
-        time, end = drive.motion.seconds(self._stamp), drive.motion.seconds(stamp)
+    def _driven(self, motion: Profile, stamp: int) -> _State:
+        """Compute the state at a time up to the timeout, along a motion."""
+        time, end = motion.seconds(self._stamp), motion.seconds(stamp)
         state = self._state
         if self._knot is not None and self._knot[0] <= end:
             time, state = self._knot
-        for piece, limit in drive.motion.steps(time, end):
+        for piece, limit in motion.steps(time, end):
             if limit == end:
                 # The state may be asked for again at a later time.
                 self._knot = time, state
             state, time = self._after_step(state, piece), limit
-        return state
+        truth = self._state[3]
+        if truth is not None:
+            L, k = self._model.wheel_separation, self._model.wheel_travel_variance
+            truth = truth.after(motion, self._stamp, stamp, L, k)
+        return *state[:3], truth
 
     def _after_step(self, state: _State, piece: Piece) -> _State:
         """Compute the state after a step of a drive; the truth is left out."""

@@ -29,6 +29,7 @@ Pose: TypeAlias = tuple[float, float, float]
 """`(x, y, theta)` (m, m, rad)."""
 Twist: TypeAlias = tuple[float, float]
 """`(v, omega)` (m/s, rad/s)."""
+STANDSTILL = (0.0, 0.0)
 MAX_TURN = 1.0
 """Largest turn of a step of the quadrature (rad)."""
 MAX_DECAY = 2.0
@@ -198,6 +199,10 @@ class Profile:
         index = bisect_right(self.begins, t) - 1
         return self.pieces[index].twist(t - self.begins[index])
 
+    def holds(self, twist: Twist, stamp: int) -> bool:
+        """Return whether it is this twist from a time (ns) on."""
+        return self.settled_at <= stamp and self.final == twist
+
     def between(self, begin: float, end: float) -> list[Piece]:
         """Return the pieces from one time to another (s)."""
         found = []
@@ -233,6 +238,8 @@ class Profile:
 
 def moved(pose: Pose, piece: Piece) -> Pose:
     """Return the pose after a piece, in steps that are short enough for one quadrature."""
+    if piece.constant:
+        return arc_end(pose, piece.twist(0.0), piece.seconds)
     begin, step = 0.0, piece.step
     for number in range(1, round(piece.seconds / step) + 1):
         part = piece.part(begin, number * step)

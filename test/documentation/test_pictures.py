@@ -201,7 +201,11 @@ def test_the_elbow_moves_and_damping_bounds_the_joints():
         (('arm_at', '--lengths', '1e300'), 2, 'the size of an arm to draw must be 1e-06 to 1e'),
         (('arm_at', '--lengths', '1', '--dh', 'a.yaml'), 2, '--lengths and --dh exclude each other'),
         (('arm_at', '--dh', 'a.yaml'), 2, '--dh a.yaml cannot be read: No such file'),
-        (('arm_ellipses', '--lengths', '1', '1', '1'), 2, 'this is for an arm of 2 links, the arm has 3'),
+        (
+            ('arm_ellipses', '--lengths', '1', '1', '1'),
+            2,
+            'this is for an arm of 2 links, the arm has 3',
+        ),
         (('geometry', '--ros-args'), 2, 'plot_jacobian takes no ROS arguments'),
         (('geometry', '-o', 'none/a.png'), 1, 'none/a.png cannot be written: No such file or directory'),
     ],

@@ -236,7 +236,7 @@ def test_a_command_that_is_held_for_long_takes_few_steps(monkeypatch):
     )
     commanded = robot(seed=1).commanded((0.2, 0.1), 5)
     commanded.at(hold)
-    assert len(steps) == hold // CELL + 1
+    assert len(steps) == hold // CELL
     commanded.at(16 * hold)
     assert len(steps) == pytest.approx(3 * hold // CELL, rel=0.02)
     before = len(steps)
