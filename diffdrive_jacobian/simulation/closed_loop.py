@@ -20,13 +20,12 @@ from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import function
 from diffdrive_jacobian.simulation.actuators import Actuators
-from diffdrive_jacobian.simulation.rollout import Array, Keep, Loops, Outcomes, Rollout, Rows
+from diffdrive_jacobian.simulation.rollout import NO_LIMITS, Array, Keep, Loops, Outcomes, Rollout, Rows
 
 BLOCK = 8192
 """Number of robots that are advanced together; their states fit into the processor's cache."""
 MAX_SAMPLES = 1e9
 """Largest number of samples that are kept, in 40 GB."""
-NO_LIMITS = VelocityLimits()
 
 
 class Trajectories(NamedTuple):
@@ -98,7 +97,7 @@ def closed_loops(
         gains=gains,
         rate=rate,
         duration=duration,
-        arrival=Arrival() if arrival is None else arrival,
+        arrival=arrival,  # type: ignore[arg-type]
         turning_gain=turning_gain,
         limits=limits,
         r=r,
@@ -113,42 +112,18 @@ def closed_loops(
 
 
 def trajectories(
-    law: Law | Controller | str,
-    starts: ArrayLike,
-    goals: ArrayLike,
-    *gains: ArrayLike,
-    rate: float = 50.0,
-    duration: float = 60.0,
-    arrival: Arrival | None = None,
-    turning_gain: ArrayLike = 3.0,
-    limits: VelocityLimits = NO_LIMITS,
-    r: ArrayLike = 0.033,
-    L: ArrayLike = 0.16,
-    actuators: Actuators | None = None,
+    law: Law | Controller | str, starts: ArrayLike, goals: ArrayLike, *gains: ArrayLike, **settings: Any
 ) -> Trajectories:
     """Drive every robot to its goal and return every sample until the last robot is finished.
 
-    Arguments and errors are those of `closed_loops`.
+    Arguments and errors are those of `closed_loops`, without `progress` and `on_step`.
     """
-    loops = Loops(
-        law=law,  # type: ignore[arg-type]
-        starts=starts,
-        goals=goals,
-        gains=gains,
-        rate=rate,
-        duration=duration,
-        arrival=Arrival() if arrival is None else arrival,
-        turning_gain=turning_gain,
-        limits=limits,
-        r=r,
-        L=L,
-        actuators=actuators,
-    )
+    loops = Loops(law=law, starts=starts, goals=goals, gains=gains, **settings)  # type: ignore[arg-type]
     count = loops.starts.shape[1]
     if (loops.steps + 1) * count > MAX_SAMPLES:
         raise ValueError(
             f'duration must be shorter, because at most {MAX_SAMPLES:g} samples are kept, '
-            f'got {duration:g} with {count} robots'
+            f'got {loops.duration:g} with {count} robots'
         )
     poses = np.empty((loops.steps + 1, count, 3))
     twists = np.zeros((loops.steps, count, 2))
@@ -164,7 +139,7 @@ def trajectories(
     held = np.minimum(np.arange(steps + 1)[:, np.newaxis], last)
     poses = poses[held, np.arange(count)]
     return Trajectories(
-        np.arange(steps + 1) / rate,
+        np.arange(steps + 1) / loops.rate,
         poses.reshape(steps + 1, *loops.shape, 3),
         twists[:steps].reshape(steps, *loops.shape, 2),
         outcomes,

@@ -40,6 +40,7 @@ MAX_STEPS = 1e12
 """Largest number of samples of a loop."""
 LOST = 1e6
 """A robot is given up when its distance to the goal has grown by this much (m)."""
+NO_LIMITS = VelocityLimits()
 SHRINK = 0.94
 """When less than this share of the robots still drives, the others are removed from the arrays [-]."""
 
@@ -77,6 +78,12 @@ def _controller(name: str, value: Any) -> Controller:
     return Controller(name='law', law=law)
 
 
+def _arrival(name: str, value: Any) -> Arrival:
+    """Require an arrival criterion; None: its defaults."""
+    arrival: Arrival = instance(name, Arrival() if value is None else value, Arrival)
+    return arrival
+
+
 def _actuators(name: str, value: Any) -> Actuators | None:
     """Require actuators whose motors are fast enough; None: commands are followed at once."""
     if value is None:
@@ -97,14 +104,14 @@ class Loops(Checked):
     starts: Any
     goals: Any
     gains: tuple[Any, ...]
-    rate: Positive
-    duration: Positive
-    arrival: Arrival
-    turning_gain: Any
-    limits: VelocityLimits
-    r: Any
-    L: Any
-    actuators: Annotated[Actuators | None, _actuators]
+    rate: Positive = 50.0
+    duration: Positive = 60.0
+    arrival: Annotated[Arrival, _arrival] = field(default_factory=Arrival)
+    turning_gain: Any = 3.0
+    limits: VelocityLimits = NO_LIMITS
+    r: Any = 0.033
+    L: Any = 0.16
+    actuators: Annotated[Actuators | None, _actuators] = None
     shape: tuple[int, ...] = field(init=False)
     """The shape of the batch."""
     columns: dict[str, Any] = field(init=False)
