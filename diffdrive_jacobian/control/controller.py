@@ -13,17 +13,15 @@ The node go_to_goal calls it with one pose at a time. Batches and sweeps call it
 
 from __future__ import annotations
 
-import math
 import re
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from keyword import iskeyword
 from math import isfinite
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -36,7 +34,6 @@ from diffdrive_jacobian.numerics.checks import (
     array,
     between,
     function,
-    instance,
     number,
     numbers,
     optional,
@@ -77,8 +74,8 @@ class Gain(Checked):
     """Lower bound that is itself not allowed, besides `bounds`."""
     label: str = ''
     """Label on the page; default: the name."""
-    usual: tuple[float, float] = (math.nan, math.nan)
-    """Range of the slider and of sweeps; default: from a tenth to three times the default value."""
+    usual: tuple[float, ...] = ()
+    """First and last value of the slider and of sweeps; default: a tenth and three times the default."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -91,7 +88,7 @@ class Gain(Checked):
         low, high = numbers('bounds', self.bounds, 2)
         object.__setattr__(self, 'bounds', (low, high))
         self.check(self.default)
-        if np.isnan(self.usual).all():
+        if self.usual == ():
             about = sorted((self.default / 10.0, 3.0 * self.default)) if self.default else [low, high]
             object.__setattr__(self, 'usual', (max(low, about[0]), min(high, about[1])))
         first, last = numbers('usual', self.usual, 2)
@@ -137,7 +134,8 @@ OFFSET = Gain(
 )
 
 
-class Boundary(NamedTuple):
+@dataclass(frozen=True)
+class Boundary:
     """A line `kp = ratio kv` in the picture of a sweep of these gains."""
 
     ratio: float
@@ -235,7 +233,7 @@ class Controller(ControlLaw):
     drives the axle centre."""
     slope: Annotated[Callable[[GainValues], float] | None, optional(function)] = None
     """Return the largest slope of the yaw rate over the heading (1/s). The sampling rate limits it."""
-    boundary: Annotated[Boundary | None, optional(partial(instance, wanted=Boundary))] = None
+    boundary: Boundary | None = None
     """Line that is drawn in the picture of a sweep."""
 
     def __post_init__(self) -> None:
@@ -293,11 +291,8 @@ class PathController(ControlLaw):
 
     def bind(self, gains: GainValues) -> BoundLaw:
         """Return the law with its gains, for single poses."""
-        return BoundLaw(self, self.values(gains), len(Reference._fields))
-
-    def lookahead_distance(self, gains: GainValues) -> float:
-        """Return the look-ahead distance (m); 0: the law has none."""
-        return float(getattr(gains, self.lookahead)) if self.lookahead else 0.0
+        lookahead = float(getattr(gains, self.lookahead)) if self.lookahead else 0.0
+        return BoundLaw(self, self.values(gains), len(Reference._fields), lookahead)
 
 
 class BoundLaw:
@@ -307,9 +302,13 @@ class BoundLaw:
     `(v, omega)`. It raises LawError if the law fails or returns something else.
     """
 
-    def __init__(self, controller: ControlLaw, values: tuple[float, ...], size: int) -> None:
+    def __init__(
+        self, controller: ControlLaw, values: tuple[float, ...], size: int, lookahead: float = 0.0
+    ) -> None:
         """Take the gains in the order of the law, and the number of entries of its goals."""
         self.controller = controller
+        self.lookahead = lookahead
+        """Look-ahead distance (m); 0: the law has none."""
         self._values = values
         self._size = size
         # An equation takes any numbers, which were checked before; another law may index arrays.

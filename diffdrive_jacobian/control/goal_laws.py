@@ -20,7 +20,7 @@ from diffdrive_jacobian.control.controller import KV, OFFSET, Boundary, Controll
 from diffdrive_jacobian.kinematics import diff_drive
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import offset, positive
-from diffdrive_jacobian.numerics.elementary import atan2, cos, hypot, minimum, sin, sinc, where, wrap
+from diffdrive_jacobian.numerics.elementary import atan2, cos, hypot, sin, sinc, where, wrap
 from diffdrive_jacobian.numerics.formula import Number, Vector, formula
 
 # --- To a position
@@ -31,12 +31,13 @@ def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Num
     """Compute the twist that drives a unicycle to a position.
 
     `e = wrap(atan2(y_g - y, x_g - x) - theta)`, `omega = Kp e`, `v = Kv d cos(e)`, where d is the
-    distance. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never grows. With `Kp <
-    Kv` the heading error does not converge to zero and the robot spirals in. Exactly on the goal, where
-    the heading towards it is undefined, v and omega are zero.
+    distance. Both gains are positive. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance
+    never grows. With `Kp <= Kv` the heading error does not converge to zero and the robot spirals in.
+    Exactly on the goal, where the heading towards it is undefined, v and omega are zero.
 
-    When the law is sampled, the robot arrives with `Kp < 2 rate` and `Kv < rate`, and if commands take
-    effect up to one sample late, with `Kp + Kv < rate`. Half of that is recommended.
+    Sampled at a rate, the robot arrives with `Kp < 2 rate` and `Kv < rate`; if commands take effect up
+    to one sample late, with `Kp + Kv < rate`. Recommended is `Kp + Kv <= rate / 2` (doc/mathematics.md,
+    "Sampling").
 
     Args:
         state: Pose of the robot, shape (..., 3).
@@ -68,6 +69,7 @@ GO_TO_GOAL = Controller(
     law=go_to_goal,
     summary="document A's law, to a position",
     advice=_go_to_goal_advice,
+    # d omega / d theta, to which the bearing adds kv as the robot moves.
     slope=lambda gains: gains.kp + gains.kv,
     boundary=Boundary(ratio=1.0, beyond='with a larger kv the robot spirals in'),
 )
@@ -96,9 +98,9 @@ def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Num
 
     As wheel speeds the law is `w = J_d^-1 k (goal - p_d)`. Here it is the body twist `u = J_w w`: `v = k
     a`, `omega = k b / d`, where `[a, b]` is the vector from the point to the goal in the body frame. The
-    distance of the point decays as exp(-k t), whatever the heading. The point comes to rest on the goal,
-    the axle centre at a distance |d| from it. When the law is sampled, this requires `k distance < 2 |d|
-    rate` and `k < rate`, and if commands take effect up to one sample late, `k (1 + distance / |d|) <
+    distance D of the point from the goal decays as exp(-k t), whatever the heading. The point comes to
+    rest on the goal, the axle centre at a distance |d| from it. Sampled at a rate, this holds for `k D <
+    2 |d| rate` and `k < rate`; if commands take effect up to one sample late, for `k (1 + D / |d|) <
     rate`. With a shorter offset the robot turns too far when the goal is far away.
 
     Args:
@@ -110,7 +112,7 @@ def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Num
     x_d, y_d = diff_drive.offset_point.formula(state, d)
     x_goal, y_goal = goal
     x_dot, y_dot = k * (x_goal - x_d), k * (y_goal - y_d)
-    # The inverse of [x_dot, y_dot] = R(theta) [[1, 0], [0, d]] [v, omega], which is J_d without J_w.
+    # J_d = R(theta) diag(1, d) J_w, so [v, omega] = diag(1, 1/d) R(theta)^T [x_dot, y_dot].
     _, _, theta = state
     v = cos(theta) * x_dot + sin(theta) * y_dot
     omega = (cos(theta) * y_dot - sin(theta) * x_dot) / d
@@ -139,10 +141,9 @@ OFFSET_POINT = Controller(
 
 # --- To a position and a heading
 
-FASTER = 2.0
-"""Ratio of the default rates at which heading and distance converge [-]."""
 STEEPEST = 2.74
-"""Largest slope of `phi cos(alpha) sin(alpha) / alpha` over alpha, with phi = pi [-]."""
+"""Largest slope over alpha of `phi cos(alpha) sin(alpha) / alpha`, the part of `go_to_pose` with h, at
+the largest phi, pi [-]."""
 
 
 @formula('(3),(3),(),(),() -> (),()', Kp=positive, Kv=positive, h=positive)
@@ -157,18 +158,19 @@ def go_to_pose(
         rho_dot = -v cos(alpha),  alpha_dot = v sin(alpha) / rho - omega,  phi_dot = v sin(alpha) / rho
 
     The law is `v = Kv rho cos(alpha)`, as in document A's law, and `omega = Kp alpha + Kv cos(alpha)
-    sin(alpha)/alpha (alpha + h phi)`. In continuous time `V = rho^2 + alpha^2 + h phi^2` never grows,
-    and all three converge to zero. Exactly on the goal's position, where the bearing is undefined, v and
-    omega are zero.
+    sin(alpha)/alpha (alpha + h phi)`. Exactly on the goal's position, where the bearing is undefined, v
+    and omega are zero.
 
-    Near the goal, heading and bearing behave like an oscillator of frequency `Kv sqrt(h)` with damping
-    Kp, and the distance decays like exp(-Kv t). For the heading to converge first, Kp should be above 2
-    Kv. A weight larger than necessary leads to longer paths. If the goal lies behind, the robot backs up
-    while it turns to it and then drives forwards. If it may not back up, it turns first.
+    In continuous time `V = rho^2 + alpha^2 + h phi^2` never grows, as `V_dot = -2 Kv rho^2 cos^2(alpha)
+    - 2 Kp alpha^2`, and all three converge to zero. Near the goal `rho_dot = -Kv rho`, `alpha_dot = -Kp
+    alpha - Kv h phi` and `phi_dot = Kv alpha`: bearing and heading are an oscillator of frequency `Kv
+    sqrt(h)`, which Kp damps. The heading converges before the distance if Kp is above 2 Kv. A weight h
+    larger than necessary leads to longer paths. If the goal lies behind, the robot backs up while it
+    turns to it and then drives forwards; if it may not back up, it turns first.
 
-    When the law is sampled with `Kp > 2 Kv`, the robot arrives with `K = Kp + Kv (1 + 2.74 h)` below
-    twice the rate, and if commands take effect up to one sample late, with K below the rate. Half of
-    that is recommended. With the default h, K is at most `6.5 Kp`.
+    Sampled at a rate, with `Kp > 2 Kv`, the robot arrives with `K = Kp + Kv (1 + 2.74 h) < 2 rate`; if
+    commands take effect up to one sample late, with `K < rate`. Recommended is `K <= rate / 2`. With the
+    default h, K is at most `6.5 Kp`.
 
     Args:
         state: Pose of the robot, shape (..., 3).
@@ -194,9 +196,8 @@ def go_to_pose(
 
 def default_weight(Kp: Number, Kv: Number) -> Number:
     """Compute the weight of the heading that `go_to_pose` takes by default, unchecked."""
-    least = minimum(Kp, 2.0 * FASTER * Kv)
-    # The parabola is continued by its tangent.
-    return (least / (2.0 * Kv)) ** 2 + FASTER * (Kp - least) / Kv
+    # The parabola of critical damping, continued by its tangent.
+    return where(Kp <= 4.0 * Kv, (Kp / (2.0 * Kv)) ** 2, 2.0 * Kp / Kv - 4.0)
 
 
 def _pose_slope(gains: GainValues) -> float:
@@ -233,7 +234,8 @@ LARGEST_TURN = 7.0 / 8.0 * tau
 def without_whole_turns(omega: Any, rate: float) -> Any:
     """Return a yaw rate without the whole turns per sample. The heading at the next sample is the same.
 
-    A robot that makes a whole turn per sample comes back to where it was, and so never arrives. omega
-    (rad/s) of shape (...), sampled at a rate (Hz), is left as it is up to a turn of 7/8 per sample.
+    A robot that makes a whole turn per sample drives a circle back to where it was, and never arrives.
+    omega (rad/s) of shape (...), sampled at a rate (Hz), is left as it is up to `LARGEST_TURN`, 7/8 of a
+    turn, which leaves room for the turns that are near to a whole one.
     """
     return where(abs(omega) <= LARGEST_TURN * rate, omega, wrap(omega / rate) * rate)

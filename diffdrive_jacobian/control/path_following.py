@@ -15,12 +15,10 @@ from dataclasses import dataclass, replace
 from math import cos, hypot, inf, pi, sin, sqrt
 from typing import Any
 
-import numpy as np
-
 from diffdrive_jacobian.control.controller import BoundLaw
 from diffdrive_jacobian.control.goal_laws import turn_in_place
 from diffdrive_jacobian.control.path import Path, Reference
-from diffdrive_jacobian.control.waypoints import Law
+from diffdrive_jacobian.control.waypoints import LawWithGains
 from diffdrive_jacobian.numerics.checks import Checked, NotNegative, Positive
 from diffdrive_jacobian.numerics.elementary import wrap
 
@@ -40,8 +38,6 @@ class PathSettings(Checked):
     """Deceleration towards its end (m/s^2)."""
     approach_distance: Positive = 0.3
     """Distance from the path beyond which the law of goals drives the robot to it (m)."""
-    lookahead: NotNegative = 0.0
-    """Look-ahead distance of the law of the path (m); 0: it has none."""
     turning_gain: Positive = 3.0
     """Gain of the turn in place (1/s)."""
     catching_up: NotNegative = 0.5
@@ -71,7 +67,7 @@ class PathFollower:
         pose: tuple[float, float, float],
         dt: float,
         law: BoundLaw,
-        law_of_goals: Law,
+        law_of_goals: LawWithGains,
         how: PathSettings,
     ) -> tuple[PathFollower, tuple[Any, Any] | None]:
         """Compute the next command.
@@ -103,7 +99,7 @@ class PathFollower:
         away = hypot(reference.x - x, reference.y - y)
         if far or (away > how.approach_distance and path.times is None):
             law.reset()
-            return here, law_of_goals(pose, np.array(reference[:3]))
+            return here, law_of_goals(pose, reference[:3])
         if away > how.approach_distance:
             # A robot that is late, but on the path, goes on along it while the trajectory waits.
             dt = 0.0
@@ -111,7 +107,9 @@ class PathFollower:
             law.reset()
             return here, turn_in_place.formula(theta, reference.theta, how.turning_gain)
         here = replace(here, elapsed=self.elapsed + dt)
-        return here, law(pose, here._target(x, y, how) if how.lookahead else here.reference(how))
+        if law.lookahead:
+            return here, law(pose, here._target(x, y, law.lookahead, how))
+        return here, law(pose, here.reference(how))
 
     def remaining(self) -> tuple[float, float]:
         """Return the rest of the path (m), and the turn that is left, which is unknown: infinite."""
@@ -138,7 +136,7 @@ class PathFollower:
         ax, ay = how.deceleration * cos(here.theta), how.deceleration * sin(here.theta)
         return here._replace(ax=here.ax - ax, ay=here.ay - ay)
 
-    def _target(self, x: float, y: float, how: PathSettings) -> Reference:
+    def _target(self, x: float, y: float, lookahead: float, how: PathSettings) -> Reference:
         """Return the first point of the path at the look-ahead distance. The path goes on straight.
 
         If the robot is farther from the path, return the nearest point.
@@ -147,16 +145,16 @@ class PathFollower:
         v = reference.v
         if self.path.times is not None:
             v = max(0.0, v + how.catching_up * (reference.s - self.s))
-        step = how.lookahead / STEPS
+        step = lookahead / STEPS
         before = distance = 0.0
         # The path may be a curl that is narrower.
         for number in range(REACH * STEPS):
             target = self._beyond(self.s + number * step, v)
             before, distance = distance, hypot(target.x - x, target.y - y)
-            if distance >= how.lookahead:
+            if distance >= lookahead:
                 break
-        if number and distance > how.lookahead:
-            excess = (distance - how.lookahead) / (distance - before)
+        if number and distance > lookahead:
+            excess = (distance - lookahead) / (distance - before)
             target = self._beyond(self.s + (number - excess) * step, v)
         return target
 

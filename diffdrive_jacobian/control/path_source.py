@@ -107,7 +107,7 @@ def planned_path(text: str) -> Path:
         raise PathError(f'{shape} needs its size (m), as in {shape}:1.0, got {short(text, repr)}')
     if shape in SHAPES:
         try:
-            return SHAPES[shape](_size('size', float(size)))
+            return SHAPES[shape](float(size))
         except ValueError:
             raise PathError(
                 f'size of a shape must be in [{LEAST_SIZE:g}, {GREATEST_SIZE:g}] m, got '
@@ -156,7 +156,7 @@ Row: TypeAlias = tuple[str, Sequence[Any], Sequence[Any]]
 def _csv_rows(file: FilePath) -> Iterator[Row]:
     """Yield the poses of a CSV file. The first line may name the columns."""
     with open(file, encoding='utf-8-sig', newline='') as stream:
-        reader = csv.reader(line for line in stream)
+        reader = csv.reader(stream)
         names: Sequence[str] = ()
         for cells in reader:
             row = [cell.strip() for cell in cells]

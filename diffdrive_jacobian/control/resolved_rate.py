@@ -92,7 +92,8 @@ def _unlimited(
     """Compute `J^+ (x_dot_d + K (x_d - x))`, with the correction not longer than allowed."""
     correction = gain * (x_desired - x)
     excess = np.sqrt(dot(correction, correction)) / max_correction
-    finite('|K (x_d - x)|', excess)
+    if not np.isfinite(excess).all():
+        raise OverflowError('|K (x_d - x)| must be finite')
     x_dot = x_dot_desired + correction / np.maximum(excess, 1.0)
     if q_dot_0 is None:
         return np.asarray(damped_least_squares.formula(J, x_dot, damping, weights=weights))

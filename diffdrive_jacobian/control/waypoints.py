@@ -33,7 +33,7 @@ from diffdrive_jacobian.numerics.formula import Number, formula
 
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
 STANDSTILL = (0.0, 0.0)
-Law: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
+LawWithGains: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
 """A control law with its gains: pose and goal, tuples of three floats, to `(v, omega)`."""
 
 
@@ -44,12 +44,6 @@ def distance_to_goal(
     """Compute the distance of the point at x = offset in the body frame from a goal, shape (...) (m)."""
     x_d, y_d = offset_point.formula((x, y, theta), offset)
     return hypot(x_goal - x_d, y_goal - y_d)
-
-
-@formula('(),() -> ()')
-def heading_error(theta: Number, heading: Number) -> Number:
-    """Compute the smaller angle from a heading to the desired one, shape (...) (rad)."""
-    return wrap(heading - theta)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -88,18 +82,8 @@ class Arrival(Comparable):
         return bool(distance <= self.xy_tolerance)
 
     def faces(self, theta: Any, heading: Any) -> Any:
-        """Return whether the robot has the heading of a goal.
-
-        Headings of the robot, theta, and of the goal have the shape (...) (rad), and so have the
-        Booleans. A heading that is not finite, shapes that do not broadcast, and a difference that
-        overflows raise ValueError.
-        """
-        return abs(heading_error(theta, heading)) <= self.yaw_tolerance
-
-    @property
-    def must_stop(self) -> bool:
-        """Whether a robot must be slow enough to count as arrived."""
-        return min(self.trans_stopped_velocity, self.rot_stopped_velocity) < math.inf
+        """Return whether a robot has the heading of a goal: numbers or arrays (rad), without checks."""
+        return abs(wrap(heading - theta)) <= self.yaw_tolerance
 
     def stopped(self, v: Any, omega: Any) -> Any:
         """Return whether a robot with a twist is slow enough, numbers or arrays; NaN is not."""
@@ -138,7 +122,7 @@ class Waypoints:
     def follow(
         self,
         pose: Pose,
-        law: Law,
+        law: LawWithGains,
         arrival: Arrival,
         turning_gain: float,
         twist: tuple[float, float] = STANDSTILL,
@@ -197,7 +181,7 @@ class Waypoints:
         tolerance, goal = arrival.xy_tolerance, self._goal
         distance = float(distance_to_goal.formula(x, y, theta, *goal[:2], arrival.offset))
         if self.turning:
-            left = abs(float(heading_error.formula(theta, goal[2])))
+            left = abs(wrap(goal[2] - theta))
             return max(tolerance - distance, tolerance / 50.0), left
         if self.index + 1 < len(self.poses):
             legs = np.hypot(*np.diff(self.poses[self.index :, :2], axis=0).T)

@@ -7,8 +7,12 @@ columns, and the rows of E's inverse, are exchanged here.
 
     w --J_w--> u --S(theta)--> q_dot
 
+`@formula('(),() -> (2,2)', r=positive)` says that a function of two numbers, of which r must be
+positive, returns a 2x2 matrix, an array. `f.formula(...)` is the same function, without checks, of
+numbers that were checked (`numerics.formula`).
+
 Everything broadcasts over leading axes. A radius or separation that is not positive and finite, an
-angle or speed that is not finite, shapes that do not broadcast, and results that overflow raise
+angle or speed that is not finite, shapes that do not broadcast, and terms or results that overflow raise
 ValueError, in single and in batched calls.
 
 Source: document A, equations (4)-(8); documents B and E; doc/mathematics.md, "Differential drive".
@@ -83,7 +87,8 @@ def body_to_wheel_jacobian(r: Number, L: Number) -> Rows:
 def wheel_to_world_jacobian(theta: Number, r: Number, L: Number) -> Rows:
     """Map wheel speeds to the velocity in the world: the whole chain `q_dot = S(theta) J_w w` (A, B, E).
 
-    For headings theta (rad), r and L (m), each of shape (...), it has the shape (..., 3, 2) and rank 2.
+    `S J_w = [[r/2 cos, r/2 cos], [r/2 sin, r/2 sin], [r/L, -r/L]]`. For headings theta (rad), r and L
+    (m), each of shape (...), it has the shape (..., 3, 2) and rank 2.
     """
     S = unicycle_jacobian.formula(theta)
     J_w = wheel_to_body_jacobian.formula(r, L)
@@ -113,7 +118,7 @@ def wheel_to_position_jacobian(theta: Number, r: Number, L: Number) -> Rows:
     can be controlled, see `offset_point_jacobian`.
 
     For headings theta (rad), r and L (m), each of shape (...), the result over `[omega_R, omega_L]` has
-    the shape (..., 2, 2). Its determinant is exactly 0.
+    the shape (..., 2, 2). Its determinant is 0.
     """
     S = unicycle_jacobian.formula(theta)
     J_w = wheel_to_body_jacobian.formula(r, L)
@@ -136,7 +141,7 @@ def offset_point_jacobian(theta: Number, r: Number, L: Number, d: Number) -> Row
     """Map wheel speeds to the velocity of the offset point (B).
 
     `J_d = R(theta) [[r/2, r/2], [d r/L, -d r/L]]`. Its determinant is `-d r^2 / L`, so it is invertible
-    for every heading if d is not 0: other d raise ValueError.
+    for every heading if d is not 0; d = 0 raises ValueError.
 
     For headings theta (rad), r, L and the coordinate x of the point in the body frame, d (m), each of
     shape (...), the result over `[omega_R, omega_L]` has the shape (..., 2, 2).
@@ -179,9 +184,9 @@ def wheel_to_body(omega_R: Number, omega_L: Number, r: Number, L: Number) -> tup
 
 @formula('(3),() -> (2,2)', L=positive)
 def wheel_centres(pose: Vector, L: Number) -> Rows:
-    """Return the positions of the centres of both wheels (E). The middle between them is the pose's.
+    """Return the centres of both wheels: `C_R = C + L/2 e_l`, `C_L = C - L/2 e_l` (E).
 
-    They are `L/2` to the right and to the left of it, along `e_l = [sin, -cos]` and against it. For
+    C is the axle centre, the position of the pose, and `e_l = [sin, -cos]` points to the right. For
     poses, shape (..., 3), and L, shape (...) (m), the result is `[[x_R, y_R], [x_L, y_L]]`, shape (...,
     2, 2) (m). Document E has them as `C_2` and `C_1`.
     """
@@ -194,10 +199,11 @@ def wheel_centres(pose: Vector, L: Number) -> Rows:
 
 @formula('(),(3),() -> (2,2)', L=positive)
 def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
-    """Return the velocities of the centres of both wheels, `v_C + theta_dot k × CC_i` (E).
+    """Return the velocities of the centres of both wheels: `v_C ± L/2 theta_dot e_f` (E).
 
-    Their mean is the velocity of the axle centre C. Of wheels that roll without slip they are `r omega_R
-    e_f` and `r omega_L e_f`, along `e_f = [cos, sin]`.
+    They are `v_C + theta_dot k × CC_i` with the vertical k, the vectors `CC_i = ± L/2 e_l` from the axle
+    centre C, and `k × e_l = e_f = [cos, sin]`. Their mean is the velocity of C. Of wheels that roll
+    without slip they are `r omega_R e_f` and `r omega_L e_f`.
 
     For headings theta, shape (...) (rad), velocities `q_dot = [x_dot, y_dot, theta_dot]` in the world,
     shape (..., 3) (m/s, m/s, rad/s), and L, shape (...) (m), the result has the shape (..., 2, 2) (m/s):
@@ -223,11 +229,14 @@ def no_lateral_slip_constraint(theta: Number) -> Rows:
 
 @formula('() -> (3)')
 def lie_bracket(theta: Number) -> Entries:
-    """Return the Lie bracket of the columns of S(theta): `[g_1, g_2] = [sin, -cos, 0]` (A, 3.2.2).
+    """Return the Lie bracket of the columns of S(theta): `[g_1, g_2] = [sin, -cos, 0]`.
 
-    `[g_1, g_2] = dg_2/dq g_1 - dg_1/dq g_2`. It is the direction that `no_lateral_slip_constraint`
-    forbids. Driving `a` forward, turning by `b`, driving back and turning back moves the robot by `a b
-    [g_1, g_2]`, to second order. For headings theta, shape (...) (rad), it has the shape (..., 3).
+    Driving `a` forward, turning by `b`, driving back and turning back moves the robot by `a b [g_1,
+    g_2]`, to second order, as in parallel parking (A, 3.2.2): along the direction that
+    `no_lateral_slip_constraint` forbids. `[g_1, g_2] = dg_2/dq g_1 - dg_1/dq g_2`. For headings theta,
+    shape (...) (rad), it has the shape (..., 3).
+
+    Source: doc/mathematics.md, "Controllability".
     """
     # dg_2/dq is zero, and dg_1/dq g_2 is the derivative of g_1 = [cos, sin, 0] by theta.
     return [sin(theta), -cos(theta), 0.0]
@@ -235,10 +244,11 @@ def lie_bracket(theta: Number) -> Entries:
 
 @formula('() -> (3,3)')
 def controllability_matrix(theta: Number) -> Rows:
-    """Return the columns `g_1, g_2, [g_1, g_2]`, of which g_1 and g_2 are those of S(theta) (A, 3.2.2).
+    """Return the columns `g_1, g_2, [g_1, g_2]`, of which g_1 and g_2 are those of S(theta).
 
-    Its rank is 3 for every heading theta, shape (...) (rad), so a unicycle reaches every pose (the Lie
-    algebra rank condition). Shape (..., 3, 3), determinant 1.
+    Its rank is 3 for every heading theta, shape (...) (rad), so a unicycle reaches every pose (A, 3.2.2:
+    controllability is preserved). This is the Lie algebra rank condition. Shape (..., 3, 3), determinant
+    1.
 
     Source: W.-L. Chow, "Über Systeme von linearen partiellen Differentialgleichungen erster Ordnung",
     1939; doc/mathematics.md, "Controllability".

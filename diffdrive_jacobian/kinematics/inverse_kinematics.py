@@ -50,6 +50,7 @@ from diffdrive_jacobian.numerics.checks import (
     Positive,
     array,
     floats,
+    function,
     integer,
     leading,
     not_negative,
@@ -208,7 +209,7 @@ def solve(
     if not weights.any():
         raise ValueError(f'mask must have an entry that is not zero, got {weights.tolist()}')
     task = Task(
-        forward=forward,
+        forward=function('forward', forward),
         jacobian=jacobian,
         difference=np.subtract if difference is None else difference,
         difference_jacobian=difference_jacobian,

@@ -132,7 +132,8 @@ def adjugate_inverse(J: Any) -> Rows:
     determinant = a * d - b * c
     # The condition number is |J|^2 / |det| (in the norm of Frobenius).
     square = a * a + b * b + c * c + d * d
-    finite('|J|^2', square)
+    if not np.isfinite(square).all():
+        raise OverflowError('|J|^2 must be finite')
     refuse_singular(determinant, abs(determinant) <= 4.0 * EPS * square + TINY)
     return [
         [d / determinant, -b / determinant],

@@ -22,14 +22,14 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body, wheel_to_world_jacobian
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm, arm_forward_kinematics, arm_jacobian
-from diffdrive_jacobian.numerics.checks import Checked, Positive, array, numbers, read_only
+from diffdrive_jacobian.numerics.checks import Checked, Positive, array, numbers, positive, read_only
 from diffdrive_jacobian.numerics.elementary import cos, product, sin
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 __all__ = ['MobileManipulator', 'mobile_manipulator_jacobian']
 
 
-@formula('(n),(),(n),(2),(),() -> (3,k)')
+@formula('(n),(),(n),(2),(),() -> (3,k)', lengths=positive, r=positive, L=positive)
 def mobile_manipulator_jacobian(
     lengths: Vector, theta: Number, q: Vector, mount: Vector, r: Number, L: Number
 ) -> Rows:
@@ -98,7 +98,7 @@ class MobileManipulator(Checked):
 
         For q, shape (..., 3 + n), it is `[x, y, heading]`, shape (..., 3) (m, m, rad).
         """
-        x, y, heading = arm_forward_kinematics.formula(self.arm.lengths, q[3:])
+        x, y, heading = arm_forward_kinematics.formula(self.arm.lengths.tolist(), q[3:])
         tip = [self.mount[0] + x, self.mount[1] + y, heading]
         pose: Entries = se2.compose.formula(q[:3], tip)
         return pose

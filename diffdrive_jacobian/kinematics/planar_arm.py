@@ -37,14 +37,14 @@ from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, f
 __all__ = ['PlanarArm', 'arm_forward_kinematics', 'arm_jacobian']
 
 
-@formula('(n),(n) -> (3)')
+@formula('(n),(n) -> (3)', lengths=positive)
 def arm_forward_kinematics(lengths: Vector, q: Vector) -> Entries:
     """Return the pose of the tip, as `PlanarArm.forward_kinematics` of links of these lengths (m)."""
     x, y = arm_links(lengths, q)
     return [sum(x), sum(y), wrap(sum(q))]
 
 
-@formula('(n),(n) -> (2,n)')
+@formula('(n),(n) -> (2,n)', lengths=positive)
 def arm_jacobian(lengths: Vector, q: Vector) -> Rows:
     """Return the Jacobian of the position, as `PlanarArm.jacobian` of links of these lengths (m)."""
     x, y = arm_links(lengths, q)
@@ -113,6 +113,10 @@ class PlanarArm:
         return len(self.lengths)
 
     @property
+    def _lengths(self) -> list[float]:
+        return list(self.lengths.tolist())
+
+    @property
     def _two_links(self) -> int:
         if self.joints != 2:
             raise ValueError(f'this is for an arm of 2 links, the arm has {self.joints}')
@@ -124,7 +128,7 @@ class PlanarArm:
 
         The result has the shape (..., n + 1, 2) (m). The first is the base, [0, 0].
         """
-        x, y = arm_links(self.lengths, q)
+        x, y = arm_links(self._lengths, q)
         return [[sum(x[:joint], 0.0), sum(y[:joint], 0.0)] for joint in range(len(q) + 1)]
 
     def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
@@ -152,7 +156,7 @@ class PlanarArm:
 
         The result has the shape (...) (m^2).
         """
-        l_1, l_2 = self.lengths
+        l_1, l_2 = self._lengths
         return l_1 * l_2 * sin(q[1])
 
     def singular_configurations(self, q_1: ArrayLike = 0.0) -> NDArray[np.float64]:
@@ -182,7 +186,7 @@ class PlanarArm:
         stretched or folded. For a tip on the base, which any q_1 reaches, q_1 is 0. A position out of
         reach raises ValueError: its distance from the base must be from `|l_1 - l_2|` to `l_1 + l_2`.
         """
-        (l_1, l_2), (x, y) = self.lengths, np.moveaxis(self._reachable(position), -1, 0)
+        (l_1, l_2), (x, y) = self.lengths, np.moveaxis(self._reachable(position), -1, 0) + 0.0
         c_2 = (x * x + y * y - l_1 * l_1 - l_2 * l_2) / (2.0 * l_1 * l_2)
         c_2 = maximum(minimum(c_2, 1.0), -1.0)  # only rounding is cut off
         s_2 = sqrt(1.0 - c_2 * c_2)
@@ -212,8 +216,8 @@ class PlanarArm:
         For velocities of the tip, shape (..., 2) (m/s), the result has the shape (..., 2) (rad/s). A
         configuration that is singular to working precision raises LinAlgError.
         """
-        (a, b), (c, d) = arm_jacobian.formula(self.lengths, q)
-        l_1, l_2 = self.lengths
+        (a, b), (c, d) = arm_jacobian.formula(self._lengths, q)
+        l_1, l_2 = self._lengths
         determinant = l_1 * l_2 * sin(q[1])
         # More accurate than from the entries of J: only the rounding of q_2 itself remains.
         blur = 4.0 * EPS * maximum(1.0, abs(q[1]))
@@ -227,7 +231,7 @@ class PlanarArm:
 
         Obstacles have the shape (..., 2), the result (...) (m).
         """
-        nearest = up_to_nearest_point(self.lengths, q, obstacle)
+        nearest = up_to_nearest_point(self._lengths, q, obstacle)
         x, y, _ = arm_forward_kinematics.formula(nearest, q)
         return hypot(x - obstacle[0], y - obstacle[1])
 
@@ -243,7 +247,7 @@ class PlanarArm:
         Source: A. A. Maciejewski, C. A. Klein, "Obstacle avoidance for kinematically redundant
         manipulators in dynamically varying environments", 1985.
         """
-        nearest = up_to_nearest_point(self.lengths, q, obstacle)
+        nearest = up_to_nearest_point(self._lengths, q, obstacle)
         x, y, _ = arm_forward_kinematics.formula(nearest, q)
         J_x, J_y = arm_jacobian.formula(nearest, q)
         away_x, away_y = x - obstacle[0], y - obstacle[1]
@@ -258,7 +262,7 @@ class PlanarArm:
         The wrench is a force `[f_x, f_y]` (N), or with the moment `[f_x, f_y, m_z]` (N, N, N m), shape
         (..., 2) or (..., 3). The result has the shape (..., n) (N m).
         """
-        J_x, J_y = arm_jacobian.formula(self.lengths, q)
+        J_x, J_y = arm_jacobian.formula(self._lengths, q)
         # A moment acts on every joint alike.
         f_x, f_y, m_z = [*wrench, 0.0][:3]
         return [J_xi * f_x + J_yi * f_y + m_z for J_xi, J_yi in zip(J_x, J_y, strict=True)]

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffdrive_jacobian.numerics.checks import finite
 from diffdrive_jacobian.numerics.formula import Array, entries_first, entries_last
 
 CUTOFF = 1e-15
@@ -75,9 +74,12 @@ class SingularValues(NamedTuple):
 
 
 def svd(J: Array) -> SingularValues:
-    """Return the singular values and vectors of Jacobians, shape (m, n, ...). Squares must be finite."""
-    # LAPACK may not terminate with infinite entries.
-    finite('|J|^2', 2.0 * np.einsum('ij...,ij...->...', J, J))
+    """Return the singular values and vectors of Jacobians, shape (m, n, ...).
+
+    OverflowError: The square of an entry is not finite. LAPACK may not terminate with infinite ones.
+    """
+    if not np.isfinite(2.0 * np.einsum('ij...,ij...->...', J, J)).all():
+        raise OverflowError('|J|^2 must be finite')
     if len(J) == 2:
         return _of_two_rows(J)
     U, s, V_transposed = np.linalg.svd(entries_last(J, 2), full_matrices=False)

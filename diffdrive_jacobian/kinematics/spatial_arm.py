@@ -35,7 +35,7 @@ from diffdrive_jacobian.kinematics.spatial import (
     rigid,
     spatial_displacement_jacobian,
 )
-from diffdrive_jacobian.numerics.checks import array, finite, floats, integer, one_of
+from diffdrive_jacobian.numerics.checks import array, finite, floats, integer, one_of, read_only
 from diffdrive_jacobian.numerics.elementary import cos, dot, product, sin
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
@@ -103,9 +103,9 @@ class SpatialArm:
             slides[integer('prismatic', joint, 0, n - 1)] = 1.0
         for name, value in {**values, 'slides': slides}.items():
             finite(name, value)
-            object.__setattr__(self, name, _read_only(value, n))
+            object.__setattr__(self, name, read_only(np.broadcast_to(value, n)))
         pair = None if limits is None else joint_limits(limits, n)
-        object.__setattr__(self, 'limits', pair and tuple(_read_only(side, n) for side in pair))
+        object.__setattr__(self, 'limits', pair and tuple(map(read_only, pair)))
 
     @property
     def joints(self) -> int:
@@ -221,12 +221,6 @@ class SpatialArm:
                 **options,
             },
         )
-
-
-def _read_only(values: ArrayLike, n: int) -> NDArray[np.float64]:
-    copy = np.array(np.broadcast_to(values, n), dtype=np.float64)
-    copy.flags.writeable = False
-    return copy
 
 
 # --- Published robots

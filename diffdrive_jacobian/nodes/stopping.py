@@ -31,7 +31,7 @@ def rolls_on(
     """
     if actuators is None or actuators.immediate or not math.isfinite(sum(twist)):
         return ''
-    distance, turn = actuators.rolled(twist, wheels)
+    distance, turn = actuators.stopping_distance(twist, wheels)
     if max(abs(distance), abs(turn)) < NEGLIGIBLE:
         return ''
     return f'; the robot rolls on for about {abs(distance):.3f} m and turns by {turn:.3f} rad'

@@ -421,12 +421,13 @@ def _declared(kind: type) -> dict[str, Check]:
 
 def _check_of(annotation: Any) -> Check | None:
     """Return what a type requires."""
-    for check in getattr(annotation, '__metadata__', ()):
-        return check  # type: ignore[no-any-return]
+    if metadata := getattr(annotation, '__metadata__', ()):
+        check: Check = metadata[0]
+        return check
     if get_origin(annotation) in (Union, UnionType):
         types = [one for one in get_args(annotation) if one is not NoneType]
-        check = _check_of(types[0]) if len(types) == 1 else None
-        return optional(check) if check else None
+        of_it = _check_of(types[0]) if len(types) == 1 else None
+        return optional(of_it) if of_it else None
     if annotation is bool or annotation is str:
         return boolean if annotation is bool else text
     if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):

@@ -155,8 +155,14 @@ def for_floats(body: Callable[..., Any]) -> Callable[..., Any]:
     of_floats = {name: OF_FLOATS[of] for name, of in names.items() if _has_floats(of)}
     code = body.__code__
     attributes = tuple('floats' if name == 'formula' else name for name in code.co_names)
-    made = FunctionType(code.replace(co_names=attributes), {**names, **of_floats}, body.__name__)
-    made.__defaults__, made.__kwdefaults__ = body.__defaults__, body.__kwdefaults__
+    made = FunctionType(
+        code.replace(co_names=attributes),
+        {**names, **of_floats},
+        body.__name__,
+        body.__defaults__,
+        body.__closure__,
+    )
+    made.__kwdefaults__ = body.__kwdefaults__
     return made
 
 

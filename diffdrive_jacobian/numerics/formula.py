@@ -6,20 +6,29 @@
                 [sin(theta), 0],
                 [0,          1]]
 
-The signature is that of NumPy's generalized universal functions, without the leading axes: `()` is a
-number, `(3)` a vector of three entries, `(3,2)` a matrix, and a letter a size that the arguments have in
-common. In a method a word is an attribute: `(joints)` has the size `self.joints`. The leading axes of
-all arguments broadcast, and the results have them. An argument whose default is None may be missing.
+    unicycle_jacobian(0.5)          # an array of shape (3, 2)
+    unicycle_jacobian([0.5, 0.6])   # of shape (2, 3, 2)
 
-The body is written for one robot, in components: a number is a float, a vector a list of floats. For a
-batch the same body is evaluated once, with arrays in place of the floats, so it uses the functions of
-`numerics.elementary`. Results are numbers, lists of numbers, or matrices as lists of rows. Beside a
-matrix all arguments are arrays with their entries first: vectors have the shape (n, ...), matrices
-(m, n, ...), and `(a, b), (c, d) = J`. Results may be such arrays, too.
+The signature has the shapes of arguments and results, as that of NumPy's generalized universal
+functions: `()` is a number, `(3)` a vector of three entries, `(3,2)` a matrix. A letter is a size that
+arguments and results have in common. In a method a word is an attribute: `(joints)` has the size
+`self.joints`. Before these axes arguments may have others, which broadcast, and which the results have,
+too. An argument whose default is None may be missing.
 
-Bad arguments raise a ValueError that names the argument, and so does a result that overflows. The body
-without these checks is `formula` of the decorated function: it is for callers whose numbers are checked.
-The same body for floats alone is `floats`: it is for what runs for every message.
+The body is written for one robot: a number is a float, a vector a list of floats, and it returns
+numbers, lists of numbers, or matrices as lists of rows. For a batch the same body is evaluated once,
+with arrays in place of the floats. They broadcast to the shape of the batch, so the body uses the
+functions of `numerics.elementary`.
+
+If any argument is a matrix, all arguments are arrays with their entries first, also for one robot:
+
+    @formula('(m,n),(n) -> (m)')
+    def task_velocity(J, q_dot):    # shapes (m, n, ...) and (n, ...)
+        return np.einsum('mn...,n...->m...', J, q_dot)
+
+Bad arguments raise a ValueError with the name of the argument, a result that overflows one with the
+names of all. The body without these checks is `formula` of the decorated function, for callers whose
+numbers are checked. `floats` is the same for floats alone, for what runs for every message.
 """
 
 from __future__ import annotations
@@ -28,7 +37,7 @@ import functools
 import inspect
 import operator
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, Protocol, TypeAlias, TypeVar, cast, overload
 
 import numpy as np
@@ -41,13 +50,143 @@ __all__ = ['formula']
 
 Array: TypeAlias = NDArray[np.float64]
 Number: TypeAlias = Any
-"""A float, or an array with one entry for each robot of a batch."""
+"""A float, or an array that broadcasts to the shape of a batch."""
 Vector: TypeAlias = Any
-"""The entries of a vector, or what the caller has given for it."""
+"""A vector as an argument: its numbers in a sequence, or an array with its entries first."""
 Entries: TypeAlias = list[Number]
 """A vector as a result."""
 Rows: TypeAlias = list[list[Number]]
 """A matrix as a result."""
+Size: TypeAlias = int | str
+"""A number, or the name of one."""
+
+
+def formula(signature: str, **checks: Check) -> _Decorator:
+    """Return the decorator of an equation.
+
+    Args:
+        signature: Shapes of the arguments and the results, such as `(3),() -> (),()`.
+        checks: What is required of an argument, by its name; of others, that they are finite.
+    """
+    inputs, outputs = map(_shapes, signature.split('->'))
+    of_matrices = any(len(shape) > 1 for shape in inputs)
+    words = {size for shape in inputs for size in shape if isinstance(size, str) and len(size) > 1}
+
+    def decorate(body: Callable[..., Any]) -> Any:
+        called = inspect.signature(body)
+        shapes = dict(zip((name for name in called.parameters if name != 'self'), inputs, strict=True))
+        optional = {name for name in shapes if called.parameters[name].default is None}
+        *others, last = shapes
+        given = f'{", ".join(others)} and {last}' if others else last
+        overflow = f'{given} must give a finite result, but it overflows'
+
+        @functools.wraps(body)
+        def checked(*args: Any, **kwargs: Any) -> Any:
+            try:
+                arguments = called.bind(*args, **kwargs).arguments
+            except TypeError as error:
+                raise TypeError(f'{body.__name__}: {error}; it takes {given}') from None
+            owner: tuple[Any, ...] = (arguments.pop('self'),) if 'self' in arguments else ()
+            sizes: dict[Size, int] = {word: getattr(owner[0], word) for word in words}
+            leads: dict[str, tuple[int, ...]] = {}
+            for name, value in list(arguments.items()):
+                if value is None and name in optional:
+                    del arguments[name]
+                    continue
+                shape = shapes[name]
+                # The first argument with a letter decides on its size.
+                array = shaped(name, value, *(sizes.get(size, size) for size in shape))
+                checks.get(name, finite)(name, array)
+                axes = array.ndim - len(shape)
+                leads[name] = array.shape[:axes]
+                sizes |= zip(shape, array.shape[axes:], strict=True)
+                arguments[name] = array
+            batch = leading(**leads)
+            entries = {
+                name: entries_first(array, len(shapes[name]), len(batch))
+                if of_matrices
+                else _components(array, len(shapes[name]), batch)
+                for name, array in arguments.items()
+            }
+            with np.errstate(all='ignore'):
+                try:
+                    results = body(*owner, **entries)
+                except ArithmeticError:
+                    raise ValueError(overflow) from None
+                except ValueError:
+                    # Floats raise it where arrays become NaN: `sin(inf)`, `sqrt(-1)`. Mistakes in the
+                    # body, and what it refuses, are raised again here.
+                    body(*owner, **{name: np.asarray(value) for name, value in entries.items()})
+                    raise ValueError(overflow) from None
+            packed = [
+                _packed(result, shape, sizes, batch)
+                for result, shape in zip(
+                    results if len(outputs) > 1 else [results], outputs, strict=True
+                )
+            ]
+            if not all(np.isfinite(one).all() for one in packed):
+                raise ValueError(overflow)
+            return tuple(packed) if len(outputs) > 1 else packed[0]
+
+        def floats(*args: Any, **kwargs: Any) -> Any:
+            # Made when it is called first: the body may call what is defined after it.
+            if checked.floats is floats:  # type: ignore[attr-defined]
+                checked.floats = for_floats(body)  # type: ignore[attr-defined]
+            return checked.floats(*args, **kwargs)  # type: ignore[attr-defined]
+
+        checked.formula, checked.floats = body, floats  # type: ignore[attr-defined]
+        return checked
+
+    return cast('_Decorator', decorate)
+
+
+def _shapes(side: str) -> list[tuple[Size, ...]]:
+    """Return the shapes in one side of a signature."""
+    return [
+        tuple(int(size) if size.isdigit() else size for size in re.findall(r'\w+', shape))
+        for shape in re.findall(r'\(([^)]*)\)', side)
+    ]
+
+
+def _components(array: Array, entries: int, batch: tuple[int, ...]) -> Any:
+    """Return a number or the entries of a vector, as floats or as arrays of a batch."""
+    if not batch:
+        return array.tolist()
+    return list(np.moveaxis(array, -1, 0)) if entries else array
+
+
+def entries_first(array: Array, entries: int, axes: int) -> Array:
+    """Move the axes of entries, so many, to the front, before the axes of the batch."""
+    padded = array.reshape((1,) * (axes + entries - array.ndim) + array.shape)
+    return np.asarray(padded.transpose(*range(axes, padded.ndim), *range(axes)), order='C')
+
+
+def entries_last(array: Array, entries: int) -> Array:
+    """Move the axes of entries, so many, behind those of the batch."""
+    return np.asarray(array.transpose(*range(entries, array.ndim), *range(entries)), order='C')
+
+
+def _packed(
+    result: Any, shape: tuple[Size, ...], sizes: Mapping[Size, int], batch: tuple[int, ...]
+) -> Any:
+    """Return a number, or the entries of a vector or a matrix (a list of rows), as one array."""
+    found: tuple[int, ...] = (len(result),) if shape else ()
+    if len(shape) > 1:
+        found = *found, *sorted({len(row) for row in result})
+    # A letter that no argument has is any size.
+    wanted = tuple(sizes.get(size, size) for size in shape)
+    if len(found) != len(wanted) or any(
+        isinstance(want, int) and got != want for got, want in zip(found, wanted, strict=True)
+    ):
+        raise TypeError(f'the equation must return the shape {wanted}, got {found}')
+    packed = np.empty((*batch, *found))
+    for index in np.ndindex(*found):
+        place = (Ellipsis, *index)
+        packed[place] = functools.reduce(operator.getitem, index, result)
+    return packed if packed.ndim else float(packed)
+
+
+# --- For type checkers
 
 P = ParamSpec('P')
 R = TypeVar('R', covariant=True)
@@ -76,105 +215,3 @@ class _Decorator(Protocol):
     def __call__(self, body: Callable[P, Entries], /) -> Formula[P, Array]: ...
     @overload
     def __call__(self, body: Callable[P, R], /) -> Formula[P, R]: ...
-
-
-def formula(signature: str, **checks: Check) -> _Decorator:
-    """Return the decorator of an equation.
-
-    Args:
-        signature: Shapes of the arguments and the results, such as `(3),() -> (),()`.
-        checks: What is required of an argument, by its name. All must be finite.
-    """
-    inputs, outputs = map(_shapes, signature.split('->'))
-    of_matrices = any(len(shape) > 1 for shape in inputs)
-    words = {size for shape in inputs for size in shape if isinstance(size, str) and len(size) > 1}
-
-    def decorate(body: Callable[..., Any]) -> Any:
-        called = inspect.signature(body)
-        shapes = dict(zip((name for name in called.parameters if name != 'self'), inputs, strict=True))
-        optional = {name for name in shapes if called.parameters[name].default is None}
-        *others, last = shapes
-        given = f'{", ".join(others)} and {last}' if others else last
-
-        @functools.wraps(body)
-        def checked(*args: Any, **kwargs: Any) -> Any:
-            try:
-                arguments = called.bind(*args, **kwargs).arguments
-            except TypeError as error:
-                raise TypeError(f'{body.__name__}: {error}; it takes {given}') from None
-            owner: tuple[Any, ...] = (arguments.pop('self'),) if 'self' in arguments else ()
-            sizes: dict[int | str, int] = {word: getattr(owner[0], word) for word in words}
-            leads: dict[str, tuple[int, ...]] = {}
-            for name, value in list(arguments.items()):
-                if value is None and name in optional:
-                    del arguments[name]
-                    continue
-                shape = shapes[name]
-                array = shaped(name, value, *(sizes.get(size, size) for size in shape))
-                checks.get(name, finite)(name, array)
-                axes = array.ndim - len(shape)
-                leads[name] = array.shape[:axes]
-                sizes |= zip(shape, array.shape[axes:], strict=True)
-                arguments[name] = array
-            batch = leading(**leads)
-            for name, array in arguments.items():
-                if of_matrices:
-                    arguments[name] = entries_first(array, len(shapes[name]), len(batch))
-                elif not batch:
-                    arguments[name] = array.tolist()
-                elif shapes[name]:
-                    arguments[name] = list(np.moveaxis(array, -1, 0))
-            try:
-                with np.errstate(all='ignore'):
-                    results = body(*owner, **arguments)
-                if len(outputs) == 1:
-                    return _packed(results, len(outputs[0]), batch)
-                return tuple(
-                    _packed(result, len(shape), batch)
-                    for result, shape in zip(results, outputs, strict=True)
-                )
-            except np.linalg.LinAlgError:
-                raise
-            except (ArithmeticError, ValueError):
-                # Floats raise these where arrays become infinite: `x**2`, `sin(inf)`, `1 / 0`.
-                raise ValueError(f'{given} must give a finite result, but it overflows') from None
-
-        def first(*args: Any, **kwargs: Any) -> Any:
-            # Not before: the body may call what is defined after it.
-            checked.floats = for_floats(body)  # type: ignore[attr-defined]
-            return checked.floats(*args, **kwargs)  # type: ignore[attr-defined]
-
-        checked.formula, checked.floats = body, first  # type: ignore[attr-defined]
-        return checked
-
-    return cast('_Decorator', decorate)
-
-
-def _shapes(side: str) -> list[tuple[int | str, ...]]:
-    """Return the shapes in one side of a signature."""
-    return [
-        tuple(int(size) if size.isdigit() else size for size in re.findall(r'\w+', shape))
-        for shape in re.findall(r'\(([^)]*)\)', side)
-    ]
-
-
-def entries_first(value: Any, entries: int, batch: int) -> Array:
-    """Move the axes of entries before those of the batch, which is given so many axes."""
-    padded = value.reshape((1,) * (batch + entries - value.ndim) + value.shape)
-    return np.asarray(padded.transpose(*range(batch, padded.ndim), *range(batch)), order='C')
-
-
-def entries_last(value: Array, entries: int) -> Array:
-    """Move the axes of the entries behind those of the batch."""
-    return np.asarray(value.transpose(*range(entries, value.ndim), *range(entries)), order='C')
-
-
-def _packed(result: Any, axes: int, batch: tuple[int, ...]) -> Any:
-    """Return a number, a vector or a matrix with the leading axes of the batch, or raise ValueError."""
-    sizes = [len(result[0]) if axis else len(result) for axis in range(axes)]
-    packed = np.empty((*batch, *sizes))
-    for index in np.ndindex(*sizes):
-        place = (Ellipsis, *index)
-        packed[place] = functools.reduce(operator.getitem, index, result)
-    finite('result', packed)
-    return packed if packed.ndim else float(packed)

@@ -279,7 +279,6 @@ class GoToGoalParameters(TwistParameters):
             speed=min(self.path_speed, self.limits().max_v),
             deceleration=min(self.path_deceleration, -self.acceleration_limits().v.max_deceleration),
             approach_distance=self.path_approach_distance,
-            lookahead=self.chosen_path_controller().lookahead_distance(self),
             turning_gain=self.kp,
             catching_up=self.kv,
             end_tolerance=self.xy_goal_tolerance,

@@ -225,8 +225,8 @@ def path_laws() -> Figure:
     start = (-0.2, 0.0, -0.97)
     x, y, _ = path.poses_at(np.linspace(0.0, path.length, 200)).T
     above.plot(x, y, color='#cccccc', lw=5.0, label='planned')
+    settings = PathSettings(speed=0.4)
     for law in PATH_CONTROLLERS:
-        settings = PathSettings(speed=0.4, lookahead=law.lookahead_distance(law.defaults))
         driven = follow_path(law, path, start=start, settings=settings)
         color, line = STYLES[law.name]
         style: Any = {'color': color, 'ls': line, 'lw': 1.2}

@@ -1,9 +1,14 @@
 """Wheels that do not follow commands at once: acceleration limits, saturated motors, lag and delay.
 
-A command passes, in this order: the delay; the limits of the acceleration, as diff_drive_controller has
-them, but with one time law s(t) for v and omega, `u(t) = u_0 + (u_1 - u_0) s(t)`; the largest speed of
-each motor, which the robot does not know; and the lag, `tau d omega / dt = omega_demanded - omega`, the
-same for both wheels. So each speed is `a + b t + c exp(-t / tau)` in each piece (`speeds`).
+A commanded twist `u = [v, omega]` passes
+
+1. the delay;
+2. the limits of the acceleration, those of diff_drive_controller, but with one time law s(t) from 0 to 1
+   for both speeds, `u(t) = u_0 + (u_1 - u_0) s(t)`, so that the curvature is kept;
+3. the largest speed of each motor, which the robot does not know: the curvature is not kept;
+4. the lag of both wheels, `tau du/dt = u_demanded - u`.
+
+So v and omega are `a + b t + c exp(-t / tau)` in each piece of time (`speeds`).
 
 Source: doc/mathematics.md, "Acceleration, lag and delay".
 """
@@ -23,6 +28,7 @@ from diffdrive_jacobian.numerics.checks import (
     nanoseconds,
     not_negative,
     number,
+    one_of,
     positive,
 )
 from diffdrive_jacobian.numerics.elementary import maximum, minimum, where
@@ -41,21 +47,26 @@ Speeds: TypeAlias = tuple[float, float]
 class AxisLimits(Checked):
     """Limits of the rate of change of one speed, v (m/s^2) or omega (rad/s^2); infinite: none.
 
-    Raises:
-        ValueError: A limit is zero, NaN or has the wrong sign.
+    | speed | rises | falls |
+    |---|---|---|
+    | positive | `max_acceleration` | `max_deceleration`, a negative number |
+    | negative | `max_deceleration_reverse` | `max_acceleration_reverse`, a negative number |
+
+    From zero it is `max_acceleration` or `max_acceleration_reverse`. A limit that is zero, NaN or of the
+    wrong sign raises ValueError.
     """
 
     max_acceleration: PositiveOrInfinite = math.inf
-    """Of a speed that is zero or positive and grows."""
+    """Forwards, positive."""
     max_deceleration: NegativeOrInfinite = -math.inf
-    """Of a positive speed that falls, negative."""
+    """Forwards, negative."""
     max_acceleration_reverse: NegativeOrInfinite = -math.inf
-    """Of a speed that is zero or negative and falls, negative."""
+    """Backwards, negative."""
     max_deceleration_reverse: PositiveOrInfinite = math.inf
-    """Of a negative speed that rises, positive."""
+    """Backwards, positive."""
 
     def rate(self, speed: Number, change: Number) -> Number:
-        """Return the largest rate, not negative, of a change in the direction of `change`."""
+        """Return the largest rate, as a positive number, of a change with the sign of `change`."""
         rising = where(speed < 0.0, self.max_deceleration_reverse, self.max_acceleration)
         falling = where(speed > 0.0, -self.max_deceleration, -self.max_acceleration_reverse)
         return where(change > 0.0, rising, falling)
@@ -88,41 +99,45 @@ class AccelerationLimits(Checked):
         return self.v.unlimited and self.omega.unlimited and self.max_wheel_acceleration == math.inf
 
     def transition(
-        self, start: Vector, target: Vector, wheel_speeds: Callable[[Number, Number], Vector]
+        self,
+        start: Vector,
+        target: Vector,
+        wheel_speeds: Callable[[Number, Number], Vector] | None = None,
     ) -> Iterator[tuple[Number, Vector]]:
-        """Yield the parts of the fastest transition along the straight line from one twist to another.
+        """Yield the three parts of the fastest transition `u_0 + (u_1 - u_0) s(t)` to a target.
 
-        `wheel_speeds` maps a twist to the wheel speeds (rad/s), linearly. Twists are those of one robot,
-        of floats, or of many, of arrays.
+        s is linear in time in each part. The parts end where v or omega is zero, where other limits
+        begin to apply, and at the target; some may be empty. Twists are those of one robot, of floats,
+        or of many, of arrays. `wheel_speeds` maps a twist to the wheel speeds (rad/s), linearly; None:
+        the limit of the wheels is left out.
 
         Yields:
-            The duration of each part, and the twist at its end. Within a part both speeds are linear in
-            time. A jump, where there is no limit, and what takes less than `SHORTEST` have no duration.
+            The duration of each part, and the twist at its end. A jump, where there is no limit, and
+            what takes less than `SHORTEST` have no duration.
         """
-        (v, omega), (v_target, omega_target) = start, target
-        dv, domega = v_target - v, omega_target - omega
-        wheels = maximum(*map(abs, wheel_speeds(dv, domega)))
-        # Where v or omega changes its sign, as a share of the transition.
-        v_zero, omega_zero = _zero(v, dv), _zero(omega, domega)
-        share, here = 0.0, start
-        for end in (minimum(v_zero, omega_zero), maximum(v_zero, omega_zero), 1.0):
-            there = (
-                where(end == 1.0, v_target, where(end == v_zero, 0.0, v + dv * end)),
-                where(end == 1.0, omega_target, where(end == omega_zero, 0.0, omega + domega * end)),
-            )
-            # The time for the whole transition at the rates of this part; at no limit zero.
+        (v_0, omega_0), (v_1, omega_1) = start, target
+        dv, domega = v_1 - v_0, omega_1 - omega_0
+        wheels = maximum(*map(abs, wheel_speeds(dv, domega))) if wheel_speeds else 0.0
+        v_zero, omega_zero = _zero(v_0, dv), _zero(omega_0, domega)
+        s, (v, omega) = 0.0, start
+        for s_end in (minimum(v_zero, omega_zero), maximum(v_zero, omega_zero), 1.0):
+            v_end = where(s_end == v_zero, 0.0, v_0 + dv * s_end)
+            omega_end = where(s_end == omega_zero, 0.0, omega_0 + domega * s_end)
+            v_end, omega_end = where(s_end == 1.0, v_1, v_end), where(s_end == 1.0, omega_1, omega_end)
+            # The time for s from 0 to 1 at the rates of this part, in the middle of which no speed is
+            # zero; where there is no limit, none.
             seconds = maximum(
-                abs(dv) / self.v.rate((here[0] + there[0]) / 2.0, dv),
-                abs(domega) / self.omega.rate((here[1] + there[1]) / 2.0, domega),
+                abs(dv) / self.v.rate((v + v_end) / 2.0, dv),
+                abs(domega) / self.omega.rate((omega + omega_end) / 2.0, domega),
                 wheels / self.max_wheel_acceleration,
             )
-            duration = seconds * (end - share)
-            yield where(duration >= SHORTEST, duration, 0.0), there
-            share, here = end, there
+            duration = seconds * (s_end - s)
+            yield where(duration >= SHORTEST, duration, 0.0), (v_end, omega_end)
+            s, v, omega = s_end, v_end, omega_end
 
 
 def _zero(speed: Number, change: Number) -> Number:
-    """Return the share of a change after which a speed is zero; 1.0 if it is not on the way."""
+    """Return the s at which a speed is zero; 1.0 if its sign does not change."""
     end = speed + change
     crosses = (minimum(speed, end) < 0.0) & (maximum(speed, end) > 0.0)
     return where(crosses, -speed / where(crosses, change, 1.0), 1.0)
@@ -194,12 +209,13 @@ class Actuators(Checked):
 
     def weakened(self, wheel: str, speed: float) -> Actuators:
         """Return actuators that turn the 'right' or 'left' wheel at most at a speed (rad/s)."""
+        one_of('right', 'left')('wheel', wheel)
         name = f'max_{wheel}_speed'
         return replace(self, **{name: min(speed, getattr(self, name))})
 
     @property
     def immediate(self) -> bool:
-        """Whether a command is followed at once."""
+        """Whether a command takes no time: a weak motor may still not reach it."""
         return not self.lag and not self.delay and self.acceleration.unlimited
 
     def limited(self, speeds: Speeds) -> Speeds:
@@ -211,12 +227,13 @@ class Actuators(Checked):
             max(-most_left, min(most_left, left)) + 0.0,
         )
 
-    def rolled(self, twist: Twist, wheels: Wheels | None = None) -> Twist:
-        """Return the distance and the turn from when zero is commanded, after a held twist, to rest.
+    def stopping_distance(self, twist: Twist, wheels: Wheels | None = None) -> Twist:
+        """Return how far a robot with a held twist rolls and turns after zero is commanded (m, rad).
 
-        Without `wheels` the limit of their acceleration is left out.
+        Without `wheels` the limit of their acceleration is left out. The largest speeds of the motors
+        are left out, too: the twist must be one that they reach.
         """
-        wheel_speeds = (lambda *_: STANDSTILL) if wheels is None else wheels.wheel_speeds
+        wheel_speeds = None if wheels is None else wheels.wheel_speeds
         parts = self.acceleration.transition(twist, STANDSTILL, wheel_speeds)
         seconds = self.reaction + sum(duration for duration, _ in parts) / 2.0
         v, omega = twist
@@ -224,7 +241,7 @@ class Actuators(Checked):
 
     @property
     def reaction(self) -> float:
-        """Time by which a stop is later than without lag and delay (s)."""
+        """Time for which a robot rolls on, as far as a stop goes, because of lag and delay (s)."""
         return self.delay / NANOSECONDS + self.lag
 
     def reached(self, twist: Twist, wheels: Wheels) -> Twist:
@@ -249,15 +266,17 @@ class Drive(NamedTuple):
         return cls(constant, constant)
 
     def followed(self, stamp: int, target: Twist, actuators: Actuators, wheels: Wheels) -> Drive:
-        """Return how the speeds go on from a time (ns) when another target is to be reached.
+        """Return how the speeds go on from a time (ns) when another target is commanded.
 
-        The motors may differ from those so far: their largest speeds and their lag are the new ones at
-        once, the limits of the acceleration after the delay, with the target.
+        During the delay the demand stays what it was. The motors may differ from those so far: their
+        largest speeds and their lag are the new ones at once, the limits of the acceleration after the
+        delay, with the target.
         """
         now = self.demanded.seconds(stamp)
         then = self.demanded.seconds(stamp + actuators.delay)
-        rise = ramp(self.demanded.twist(then), target, actuators.acceleration, wheels)
-        demanded = [*self.demanded.between(now, then), *rise]
+        until_then = self.demanded.between(now, then)
+        after = ramp(self.demanded.twist(then), target, actuators.acceleration, wheels)
+        demanded = [*until_then, *after]
         motion = demanded
         if actuators.max_right_speed < math.inf or actuators.max_left_speed < math.inf:
             motion = list(_saturated(demanded, actuators, wheels))
@@ -308,16 +327,19 @@ def _saturated(pieces: Iterable[Piece], actuators: Actuators, wheels: Wheels) ->
 
 
 def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece]:
-    """Return how speeds follow others, which are linear in each piece, with first order."""
-    settling = SETTLING * tau
+    """Return how speeds that are `here` follow others, which are `a + b t` in each piece.
+
+    The solution of `tau du/dt = a + b t - u` is `(a - b tau) + b t + (u(0) - (a - b tau)) exp(-t /
+    tau)`. After `SETTLING` time constants the exponential function is left out.
+    """
     for piece in pieces:
         v, omega = (
-            (a - b * tau, b, _rest(speed, a - b * tau))
-            for (a, b, _), speed in zip(piece[1:3], here, strict=True)
+            (a - b * tau, b, 0.0 if _is_close(u, a - b * tau) else u - (a - b * tau))
+            for (a, b, _), u in zip((piece.v, piece.omega), here, strict=True)
         )
         begin = 0.0
         if v[2] or omega[2]:
-            lagging = Piece(min(piece.seconds, settling), v, omega, tau)
+            lagging = Piece(min(piece.seconds, SETTLING * tau), v, omega, tau)
             yield lagging
             begin, here = lagging.seconds, lagging.twist(lagging.seconds)
         if begin < piece.seconds:
@@ -327,7 +349,6 @@ def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece
                 here = line.twist(line.seconds)
 
 
-def _rest(speed: float, asymptote: float) -> float:
-    """Return by how much a lagging speed differs, zero if by its rounding error alone."""
-    reached = math.isclose(speed, asymptote, rel_tol=1e-15, abs_tol=1e-16)
-    return 0.0 if reached else speed - asymptote
+def _is_close(u: float, asymptote: float) -> bool:
+    """Return whether they differ by rounding errors alone."""
+    return math.isclose(u, asymptote, rel_tol=1e-15, abs_tol=1e-16)

@@ -136,7 +136,7 @@ def _followed(
         The twist at the end, and the distance and the turn, added to those before.
     """
     (v, omega), (distance, turn) = start, way
-    for duration, (next_v, next_omega) in limits.transition(start, target, _without_wheels):
+    for duration, (next_v, next_omega) in limits.transition(start, target):
         if duration > seconds:
             share, duration = seconds / duration, seconds
             next_v, next_omega = v + share * (next_v - v), omega + share * (next_omega - omega)
@@ -148,7 +148,3 @@ def _followed(
     if seconds < math.inf:
         distance, turn = distance + v * seconds, turn + omega * seconds
     return (v, omega), (distance, turn)
-
-
-def _without_wheels(_v: float, _omega: float) -> Twist:
-    return STANDSTILL

@@ -67,7 +67,7 @@ def closed_loops(
             `control.controller_names()`.
         starts: Poses, shape (..., 3).
         goals: Positions or poses, shape (..., 2) or (..., 3), as the law requires.
-        gains: Further arguments of the law, each of shape (...).
+        gains: Further arguments of the law, each of shape (...). None for a `Controller`: its defaults.
         rate: Control rate (Hz).
         duration: Time after which a robot is given up (s).
         arrival: Arrival criterion; None: its defaults. If the heading counts (`use_heading=True`, as

@@ -143,8 +143,9 @@ class SweepSetup(Checked):
 
     def ends(self, gain: Gain) -> tuple[float, float]:
         """Return the first and the last value of a gain that is swept."""
-        given = self.gains.get(gain.name, gain.usual)
-        return given if isinstance(given, tuple) else (given, given)
+        given = self.gains.get(gain.name)
+        first, last = given if isinstance(given, tuple) else gain.usual
+        return first, last
 
     def values(self, gain: Gain) -> Array:
         """Return the values of a gain that is swept, evenly spaced and rounded to 9 decimals."""

@@ -24,7 +24,7 @@ from diffdrive_jacobian.simulation.exact_moments import (
     propagated_moments,
 )
 from diffdrive_jacobian.simulation.odometry_noise import spectral_densities
-from diffdrive_jacobian.simulation.speeds import Course, Piece, sign_changes, travelled
+from diffdrive_jacobian.simulation.speeds import Piece, sign_changes, travelled
 
 MAX_NOISE = 0.25
 """Largest m of a step of the quadrature."""
@@ -39,7 +39,8 @@ def moments_along(
 
     `theta` is the heading at the start (rad), L the wheel separation (m), k as of `odometry_noise` (m).
     """
-    right, left = _rims(piece, L)
+    rims = piece.mapped(((1.0, L / 2.0), (1.0, -L / 2.0)))
+    right, left = rims.v, rims.omega
     turns = (*sign_changes(right, dt, piece.tau), *sign_changes(left, dt, piece.tau))
     knots = [0.0, *sorted(turns), dt]
     found: Entries | None = moments
@@ -70,12 +71,6 @@ def _evenly(piece: Piece) -> Piece:
     _, _, path, turn = piece.state(piece.seconds)
     v, omega = path / piece.seconds, turn / piece.seconds
     return Piece(piece.seconds, (v, 0.0, 0.0), (omega, 0.0, 0.0))
-
-
-def _rims(piece: Piece, L: float) -> tuple[Course, Course]:
-    """Return the speeds of the rims of the right and the left wheel."""
-    (a, b, c), (d, e, f) = piece.v, ((L / 2.0) * part for part in piece.omega)
-    return (a + d, b + e, c + f), (a - d, b - e, c - f)
 
 
 def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> Entries | None:

@@ -75,7 +75,7 @@ def _controller(name: str, value: Any) -> Controller:
     if isinstance(value, Controller):
         return value
     law = function(name, value, 'a function, a Controller, or the name of one')
-    return Controller(name='law', law=law)
+    return Controller(name='law', law=law, gains=())
 
 
 def _arrival(name: str, value: Any) -> Arrival:
@@ -128,8 +128,9 @@ class Loops(Checked):
             raise ValueError(
                 f'duration must be below {MAX_STEPS / self.rate:g} s at that rate, got {self.duration:g}'
             )
+        gains = self.gains or tuple(gain.default for gain in self.law.gains)
         columns = {
-            **{f'gain {index}': array(f'gain {index}', one) for index, one in enumerate(self.gains)},
+            **{f'gain {index}': array(f'gain {index}', one) for index, one in enumerate(gains)},
             'turning_gain': array('turning_gain', self.turning_gain),
             'offset': floats('offset', self.arrival.offset),
             'r': positive('r', floats('r', self.r)),
@@ -298,14 +299,12 @@ class Rollout:
             if np.any(arrival.offset):
                 distance = distance_to_goal.formula(x, y, theta, *goal[:2], arrival.offset)
         there = near = distance <= arrival.xy_tolerance
-        stopped = arrival.stopped(*robots.twist) if arrival.must_stop else np.True_
+        stopped = arrival.stopped(*robots.twist)
         if arrival.use_heading:
             robots.turning |= near & stopped
-            there = robots.turning & (abs(wrap(goal[2] - theta)) <= arrival.yaw_tolerance)
-        if arrival.must_stop:
-            robots.stopping = (there | near & ~robots.turning) & ~stopped
-            there = there & stopped
-        return there, distance > robots.too_far
+            there = robots.turning & arrival.faces(theta, goal[2])
+        robots.stopping = (there | near & ~robots.turning) & ~stopped
+        return there & stopped, distance > robots.too_far
 
     def _command(self, step: int) -> tuple[Array, Array]:
         """Evaluate the law, and limit its twists."""

@@ -205,6 +205,13 @@ def test_who_is_there_has_no_use_for_the_law_any_more():
     assert [field[0] for field in found[1:5]] == [0.0] * 4
 
 
+def test_a_controller_without_gains_has_its_defaults():
+    assert_same(
+        closed_loops('go_to_goal', [1.0, 0.5, 2.0], [0.0, 0.0]),
+        closed_loops(go_to_goal, [1.0, 0.5, 2.0], [0.0, 0.0], 3.0, 0.5),
+    )
+
+
 def test_an_empty_batch_is_an_empty_result():
     for shape in ((0,), (3, 0)):
         said = []

@@ -12,6 +12,7 @@ from diffdrive_jacobian.control import (
     Path,
     PathController,
     VelocityLimits,
+    figure_eight_path,
     find_controller,
     line_path,
 )
@@ -199,9 +200,17 @@ def test_the_look_ahead_point_is_beyond_the_end_of_an_open_path():
     path = Path(np.array([[0.0, 0.0], [1.0, 0.0]]))
     law = PURE_PURSUIT.bind(PURE_PURSUIT.defaults)
     follower = PathFollower(path, s=0.9)
-    _, command = follower.follow((0.95, 0.05, 0.0), 0.02, law, law, PathSettings(lookahead=0.2))
+    _, command = follower.follow((0.95, 0.05, 0.0), 0.02, law, law, PathSettings())
     v, omega = command
     assert omega == pytest.approx(2.0 * v * -0.05 / 0.2**2, rel=1e-2)
+
+
+def test_settings_do_not_change_the_look_ahead_of_the_law():
+    path = figure_eight_path(1.0)
+    alone = follow_path('pure_pursuit', path, start=(0.0, 0.1, 0.0))
+    same = follow_path('pure_pursuit', path, start=(0.0, 0.1, 0.0), settings=PathSettings())
+    np.testing.assert_array_equal(same.poses, alone.poses)
+    assert np.abs(alone.errors[:, 1]).max() < 0.11
 
 
 def test_invalid_arguments_are_named():
@@ -209,7 +218,7 @@ def test_invalid_arguments_are_named():
         ({'controller': find_controller('pose')}, 'controller must be of class PathController'),
         ({'controller': 'pose'}, "path_controller must be one of .* got 'pose', a law of goals"),
         ({'path': [[0, 0], [1, 0]]}, 'path must be of class Path'),
-        ({'rate': 0.0}, 'rate must be positive'),
+        ({'rate': 0.0}, r'rate must be in \(0, 1000000000\] Hz'),
         ({'gains': {'k_y': math.nan}}, 'k_y must be in'),
         ({'gains': {'kp': 1.0}}, 'gains must be among k_x, k_y, k_theta, got kp'),
     ):

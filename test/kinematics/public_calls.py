@@ -131,7 +131,6 @@ BROADCASTING = {
         **{'q_dot_0': POSE, 'max_correction': 0.3, 'weights': WEIGHTS, 'max_velocity': (0.1, 0.4, 0.2)},
     },
     Arrival(offset=0.1).distance: {'x': 0.1, 'y': 0.2, **THETA, 'x_goal': 1.0, 'y_goal': 2.0},
-    Arrival().faces: {'theta': 0.5, 'heading': 0.51},
     odometry_noise.twist_covariance: {'twist': TWIST, **ODOMETRY, 'interval': 0.02},
     odometry_noise.propagate_covariance: {
         **{'covariance': COVARIANCE, 'pose': POSE, 'twist': TWIST, 'dt': 0.5},

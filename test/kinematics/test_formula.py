@@ -100,3 +100,62 @@ def test_the_equation_alone_is_not_checked():
     assert circle.formula(-1.0, 0.0) == (-1.0, 0.0)
     x, y = rotated.formula((np.ones(3), np.zeros(3)), 0.0)
     np.testing.assert_array_equal((x, y), [np.ones(3), np.zeros(3)])
+
+
+def test_mistakes_in_a_body_are_not_called_an_overflow():
+    @formula('(3) -> ()')
+    def unpacks(x):
+        a, b = x
+        return a + b
+
+    @formula('() -> ()')
+    def refuses(x):
+        if np.any(x > 1.0):
+            raise ValueError('too far')
+        return x
+
+    @formula('(n) -> (2,n)')
+    def short(x):
+        return [x, x[1:]]
+
+    with pytest.raises(ValueError, match='too many values to unpack'):
+        unpacks([1.0, 2.0, 3.0])
+    for far in (2.0, [0.0, 2.0]):
+        with pytest.raises(ValueError, match='too far'):
+            refuses(far)
+    longer, pair = formula('(n) -> (n)')(lambda x: [*x, 1.0]), formula('() -> (2)')(lambda x: [x])
+    for wrong in (short, longer, pair):
+        with pytest.raises(TypeError, match=r'^the equation must return the shape \('):
+            wrong([1.0, 2.0])
+
+
+def test_the_equation_for_floats_may_be_made_in_a_function_and_kept():
+    gain = 2.0
+
+    @formula('() -> ()')
+    def scaled_sine(x):
+        return gain * sin(x)
+
+    floats = scaled_sine.floats
+    assert floats(0.5) == floats(0.5) == scaled_sine(0.5) == 2.0 * np.sin(0.5)
+    assert scaled_sine.floats is not floats
+
+
+class Chain:
+    """A method whose sizes are an attribute."""
+
+    joints = 3
+
+    @formula('(joints),() -> (joints)')
+    def turned(self, q, angle):
+        return [q_i + angle for q_i in q]
+
+
+def test_a_method_may_be_an_equation():
+    chain = Chain()
+    assert chain.turned([0.0, 1.0, 2.0], angle=1.0).tolist() == [1.0, 2.0, 3.0]
+    assert chain.turned(np.zeros((4, 3)), [[1.0], [2.0]]).shape == (2, 4, 3)
+    with pytest.raises(ValueError, match=r'^q must have shape \(\.\.\., 3\), got \(2,\)'):
+        chain.turned([0.0, 1.0], 1.0)
+    with pytest.raises(TypeError, match='it takes q and angle'):
+        chain.turned([0.0, 1.0, 2.0])

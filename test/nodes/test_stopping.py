@@ -43,7 +43,9 @@ def test_a_robot_rolls_as_far_as_predicted():
         stopped = robot.commanded((0.0, 0.0), robot.stamp).at(40 * SECOND)
         right, left = np.subtract(stopped.wheel_angles, robot.wheel_angles)
         distance, turn = 0.033 * (right + left) / 2.0, 0.033 * (right - left) / 0.16
-        assert ACTUATORS.rolled(command, robot.model) == pytest.approx((distance, turn), abs=1e-9)
+        assert ACTUATORS.stopping_distance(command, robot.model) == pytest.approx(
+            (distance, turn), abs=1e-9
+        )
 
 
 PERIOD = SECOND // 50

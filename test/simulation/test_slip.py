@@ -11,7 +11,7 @@ import pytest
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
-from diffdrive_jacobian.simulation import Robot, RobotModel
+from diffdrive_jacobian.simulation import Actuators, Robot, RobotModel
 from diffdrive_jacobian.simulation.slip import CELL, Drift, _block, normals
 
 SECOND = 1_000_000_000
@@ -222,6 +222,15 @@ def test_the_robot_stays_where_it_is_when_time_goes_back_or_its_drift_changes():
     perfect = moved.remodelled(RobotModel(), SECOND)
     assert perfect.true_pose_tuple == perfect.pose_tuple
     assert perfect.remodelled(other, SECOND).true_pose_tuple == perfect.pose_tuple
+
+
+def test_a_robot_that_is_restarted_does_not_slip_on():
+    """Also not one that was under way to another speed."""
+    model = RobotModel(drift=Drift(seed=1), actuators=Actuators(lag=0.1))
+    moving = Robot(model=model, stamp=0, pose=(0, 0, 0)).commanded((0.2, 1.0), 0).at(105_000_000)
+    restarted = moving.restarted(105_000_000)
+    assert restarted.true_twist == (0.0, 0.0)
+    assert restarted.at(SECOND).true_pose_tuple == moving.true_pose_tuple
 
 
 # --- Long times
