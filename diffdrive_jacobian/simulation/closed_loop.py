@@ -119,7 +119,7 @@ def trajectories(
     Arguments and errors are those of `closed_loops`, without `progress` and `on_step`.
     """
     loops = Loops(law=law, starts=starts, goals=goals, gains=gains, **settings)  # type: ignore[arg-type]
-    count = loops.starts.shape[1]
+    count = loops.columns.starts.shape[1]
     if (loops.steps + 1) * count > MAX_SAMPLES:
         raise ValueError(
             f'duration must be shorter, because at most {MAX_SAMPLES:g} samples are kept, '
@@ -153,14 +153,15 @@ def _drive(
     on_step: Callable[[int], object] | None = None,
 ) -> Outcomes:
     """Drive a batch block by block and return its outcomes."""
+    columns = loops.columns
     if hasattr(loops.law.law, 'formula'):
         # The law checks its arguments, the equation does not.
         try:
             state = {'state': np.array(loops.law.state), 'dt': 0.0} if loops.law.state else {}
-            loops.law.law(loops.starts.T, loops.goals.T, *loops.gains, **state)
+            loops.law.law(columns.starts.T, columns.goals.T, *columns.gains, **state)
         except ValueError as error:
             raise ValueError(f'law rejects the starts, goals and gains: {error}') from error
-    count = loops.starts.shape[1]
+    count = loops.columns.starts.shape[1]
     found = Outcomes(
         np.zeros(count, dtype=np.bool_),
         np.full(count, np.nan),

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -96,9 +95,36 @@ def _actuators(name: str, value: Any) -> Actuators | None:
     return None if actuators.immediate else actuators
 
 
-@dataclass(kw_only=True, eq=False)
+class Columns(NamedTuple):
+    """What may differ between robots: arrays with the robots in the last axis, or numbers for all."""
+
+    starts: Array
+    """Shape (3, n)."""
+    goals: Array
+    """Shape (2, n) or (3, n)."""
+    gains: tuple[Any, ...]
+    turning_gain: Any
+    offset: Any
+    """Of the point that is to arrive."""
+    limits: tuple[Any, ...]
+    """In the order of `VelocityLimits.all`."""
+    r: Any
+    L: Any
+
+    def some(self, rows: Any) -> Columns:
+        """Return those of some of the robots, each coordinate contiguous in memory."""
+
+        def of(value: Any) -> Any:
+            if isinstance(value, tuple):
+                return tuple(map(of, value))
+            return value if isinstance(value, float) else value[..., rows].copy()
+
+        return Columns._make(map(of, self))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Loops(Checked):
-    """The arguments of `closed_loops`, checked, with the robots of the batch in one axis."""
+    """The arguments of `closed_loops`, checked."""
 
     law: Annotated[Controller, _controller]
     starts: Any
@@ -113,8 +139,9 @@ class Loops(Checked):
     L: Any = 0.16
     actuators: Annotated[Actuators | None, _actuators] = None
     shape: tuple[int, ...] = field(init=False)
-    """The shape of the batch."""
-    columns: dict[str, Any] = field(init=False)
+    """Shape of the batch."""
+    columns: Columns = field(init=False)
+    """The same with the robots of the batch in one axis."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -129,46 +156,36 @@ class Loops(Checked):
                 f'duration must be below {MAX_STEPS / self.rate:g} s at that rate, got {self.duration:g}'
             )
         gains = self.gains or tuple(gain.default for gain in self.law.gains)
-        columns = {
+        named = {
             **{f'gain {index}': array(f'gain {index}', one) for index, one in enumerate(gains)},
             'turning_gain': array('turning_gain', self.turning_gain),
             'offset': floats('offset', self.arrival.offset),
-            'r': positive('r', floats('r', self.r)),
-            'L': positive('L', floats('L', self.L)),
             **{
                 name: floats(name, limit)
                 for name, limit in zip(self.limits.names(), self.limits.all(), strict=True)
             },
+            'r': positive('r', floats('r', self.r)),
+            'L': positive('L', floats('L', self.L)),
         }
-        shapes = {name: value.shape for name, value in columns.items()}
-        self.shape = shape = leading(starts=starts.shape[:-1], goals=goals.shape[:-1], **shapes)
-        flat = {
-            name: np.broadcast_to(value, shape).reshape(-1) if value.ndim else float(value)
-            for name, value in columns.items()
-        }
-        flat['starts'] = np.broadcast_to(starts, (*shape, 3)).reshape(-1, 3).T
-        flat['goals'] = np.broadcast_to(goals, (*shape, size)).reshape(-1, size).T
-        self._take(flat)
-
-    def _take(self, columns: dict[str, Any]) -> None:
-        """Set what may differ between robots: with the robots in the last axis, or a number for all."""
-        self.columns = columns
-        self.gains = tuple(value for name, value in columns.items() if name.startswith('gain '))
-        for name in ('starts', 'goals', 'turning_gain', 'r', 'L'):
-            setattr(self, name, columns[name])
-        self.arrival = replace(self.arrival, offset=columns['offset'])
-        self.limits = VelocityLimits(**{name: columns[name] for name in self.limits.names()})
-
-    def some(self, rows: Any) -> Loops:
-        """Return the loops of some of the robots, each coordinate contiguous in memory."""
-        loops = copy(self)
-        loops._take(
-            {
-                name: one if isinstance(one, float) else one[..., rows].copy()
-                for name, one in self.columns.items()
-            }
+        shapes = {name: value.shape for name, value in named.items()}
+        shape = leading(starts=starts.shape[:-1], goals=goals.shape[:-1], **shapes)
+        flat = [
+            np.broadcast_to(value, shape).reshape(-1) if value.ndim else float(value)
+            for value in named.values()
+        ]
+        *of_law, turning_gain, offset, min_v, max_v, min_omega, max_omega, wheels, r, L = flat
+        columns = Columns(
+            starts=np.broadcast_to(starts, (*shape, 3)).reshape(-1, 3).T,
+            goals=np.broadcast_to(goals, (*shape, size)).reshape(-1, size).T,
+            gains=tuple(of_law),
+            turning_gain=turning_gain,
+            offset=offset,
+            limits=(min_v, max_v, min_omega, max_omega, wheels),
+            r=r,
+            L=L,
         )
-        return loops
+        object.__setattr__(self, 'shape', shape)
+        object.__setattr__(self, 'columns', columns)
 
     @property
     def steps(self) -> int:
@@ -210,18 +227,18 @@ class Robots:
     """Distance from the goal at which a robot is given up (m)."""
 
     @classmethod
-    def at_starts(cls, loops: Loops, rows: Rows) -> Robots:
-        """Return the robots of some loops at rest at their starts."""
-        count = len(rows)
+    def at_starts(cls, rows: Rows, columns: Columns, memory: tuple[float, ...]) -> Robots:
+        """Return robots at rest at their starts, with what a law remembers then."""
+        count, starts = len(rows), columns.starts
         with np.errstate(over='ignore', invalid='ignore'):
-            line = loops.goals[:2] - loops.starts[:2]
+            line = columns.goals[:2] - starts[:2]
             length = hypot(*line)
             along = line / np.where(length > 0.0, length, 1.0)
         return cls(
             rows=rows,
-            pose=np.array([*loops.starts[:2], wrap(loops.starts[2])]),
+            pose=np.array([*starts[:2], wrap(starts[2])]),
             twist=np.zeros((2, count)),
-            memory=np.repeat(np.array(loops.law.state)[:, np.newaxis], count, axis=1),
+            memory=np.repeat(np.array(memory)[:, np.newaxis], count, axis=1),
             open=np.ones(count, dtype=np.bool_),
             turning=np.zeros(count, dtype=np.bool_),
             stopping=np.zeros(count, dtype=np.bool_),
@@ -242,8 +259,8 @@ class Rollout:
 
     def __init__(self, loops: Loops, rows: Rows) -> None:
         """Place the robots of these rows of the batch at their starts."""
-        self.loops = loops = loops.some(rows)
-        self.robots = Robots.at_starts(loops, rows)
+        self.loops, self.columns = loops, loops.columns.some(rows)
+        self.robots = Robots.at_starts(rows, self.columns, loops.law.state)
         self.follower: Follower | None = None
         if loops.actuators is not None:
             self.follower = Follower(loops.actuators, len(rows), loops.rate)
@@ -280,7 +297,7 @@ class Rollout:
                 return
             if left < SHRINK * len(robots.rows):
                 still = np.flatnonzero(robots.open)
-                self.loops, self.robots = self.loops.some(still), robots.some(still)
+                self.columns, self.robots = self.columns.some(still), robots.some(still)
                 v, omega = v[still], omega[still]
                 if self.follower is not None:
                     self.follower.shrink(still)
@@ -290,14 +307,15 @@ class Rollout:
 
     def _check_ends(self) -> tuple[Mask, Mask]:
         """Return which robots have arrived, and which were driven away by their law."""
-        robots, arrival, goal = self.robots, self.loops.arrival, self.loops.goals
+        robots, arrival = self.robots, self.loops.arrival
+        goal, offset = self.columns.goals, self.columns.offset
         x, y, theta = robots.pose
         with np.errstate(over='ignore', invalid='ignore'):
             dx, dy = goal[0] - x, goal[1] - y
             robots.beyond = np.maximum(robots.beyond, -dot(robots.along, (dx, dy)))
             distance = hypot(dx, dy)
-            if np.any(arrival.offset):
-                distance = distance_to_goal.formula(x, y, theta, *goal[:2], arrival.offset)
+            if np.any(offset):
+                distance = distance_to_goal.formula(x, y, theta, *goal[:2], offset)
         there = near = distance <= arrival.xy_tolerance
         stopped = arrival.stopped(*robots.twist)
         if arrival.use_heading:
@@ -308,7 +326,8 @@ class Rollout:
 
     def _command(self, step: int) -> tuple[Array, Array]:
         """Evaluate the law, and limit its twists."""
-        loops, robots, (count,) = self.loops, self.robots, self.robots.rows.shape
+        loops, columns, robots = self.loops, self.columns, self.robots
+        (count,) = robots.rows.shape
         twist, memory = self._evaluate(step), len(robots.memory)
         try:
             if memory:
@@ -322,9 +341,9 @@ class Rollout:
                 f'got {twist!r:.80}'
             ) from error
         if loops.arrival.use_heading and robots.turning.any():
-            turn = wrap(loops.goals[2] - robots.pose[2])
+            turn = wrap(columns.goals[2] - robots.pose[2])
             v = np.where(robots.turning, 0.0, v)
-            omega = np.where(robots.turning, loops.turning_gain * turn, omega)
+            omega = np.where(robots.turning, columns.turning_gain * turn, omega)
         driven = robots.open & np.isnan(robots.time) & ~robots.stopping
         if not driven.all():
             # Finished robots stand still, whatever their law returns.
@@ -344,15 +363,15 @@ class Rollout:
 
     def _evaluate(self, step: int) -> Any:
         """Return what the law returns: an equation of components, or a function of arrays of poses."""
-        loops, robots = self.loops, self.robots
+        loops, columns, robots = self.loops, self.columns, self.robots
         law, more = loops.law.law, {}
         equation = getattr(law, 'formula', None)
         if len(robots.memory):
             more = {'state': robots.memory if equation else robots.memory.T}
             more['dt'] = 1.0 / loops.rate if step else 0.0
         if equation is None:
-            return law(robots.pose.T, loops.goals.T, *loops.gains, **more)
-        found = equation(robots.pose, loops.goals, *loops.gains, **more)
+            return law(robots.pose.T, columns.goals.T, *columns.gains, **more)
+        found = equation(robots.pose, columns.goals, *columns.gains, **more)
         if not more:
             return found
         v, omega, state = found
@@ -360,12 +379,11 @@ class Rollout:
 
     def _limited(self, v: Array, omega: Array) -> tuple[Array, Array]:
         """Scale twists to the velocity limits."""
-        loops = self.loops
-        if loops.limits.unlimited:
+        if self.loops.limits.unlimited:
             return v, omega
         with np.errstate(all='ignore'):
             limited: tuple[Array, Array] = scaled_to_limits.formula(
-                v, omega, *loops.limits.all(), loops.r, loops.L
+                v, omega, *self.columns.limits, self.columns.r, self.columns.L
             )
         return limited
 
@@ -379,7 +397,7 @@ class Rollout:
             return
 
         def wheel_speeds(v: Array, omega: Array) -> Any:
-            return body_to_wheel.formula(v, omega, loops.r, loops.L)
+            return body_to_wheel.formula(v, omega, self.columns.r, self.columns.L)
 
         for rows, displacement, sums in self.follower.advance(wheel_speeds, np.array([v, omega])):
             robots.pose[:, rows] = compose.formula(robots.pose[:, rows], displacement)
@@ -388,11 +406,11 @@ class Rollout:
 
     def _outcomes(self, done: Mask) -> tuple[Rows, Outcomes]:
         """Return the rows and the outcomes of the robots that are finished."""
-        loops, robots = self.loops.some(done), self.robots.some(np.flatnonzero(done))
+        columns, robots = self.columns.some(done), self.robots.some(np.flatnonzero(done))
         with np.errstate(all='ignore'):
-            path, squares_v, squares_omega = robots.sums / loops.rate
+            path, squares_v, squares_omega = robots.sums / self.loops.rate
             # Both wheels: (v + omega L/2)^2 + (v - omega L/2)^2, over r^2.
-            r, L = np.asarray(loops.r), np.asarray(loops.L)
+            r, L = np.asarray(columns.r), np.asarray(columns.L)
             control_cost = 2.0 * (squares_v + squares_omega * (L / 2.0) ** 2) / r**2
         arrived = np.isfinite(robots.time)
         outcomes = Outcomes(arrived, robots.time, path, control_cost, robots.beyond, robots.pose.T)
