@@ -292,7 +292,6 @@ def _drive(setup: SweepSetup, rows: slice, progress: Callable[[int], object] | N
     if controller.offset:
         arrival = replace(arrival, offset=values[controller.offset])
     starts, goal = setup.poses(), np.zeros(3 if controller.takes_heading else 2)
-    _check_law(controller, starts, goal, gains)
     return closed_loops(
         controller,
         starts,
@@ -334,22 +333,6 @@ def _drive_on(
         for future in futures:
             future.cancel()
     return Outcomes._make(np.concatenate(fields) for fields in zip(*parts, strict=True))
-
-
-def _check_law(controller: Controller, starts: Array, goal: Array, gains: list[Any]) -> None:
-    """Evaluate a law once for all starts, which those for single poses do not accept."""
-    first = [float(np.ravel(gain)[0]) for gain in gains]
-    goals = np.broadcast_to(goal, (len(starts), len(goal)))
-    more: dict[str, Any] = {}
-    if controller.state:
-        more = {'state': np.tile(controller.state, (len(starts), 1)), 'dt': 0.0}
-    try:
-        controller.law(starts, goals, *first, **more)
-    except Exception as error:
-        raise ValueError(
-            f'the law of controller {controller.name!r} must accept poses of shape '
-            f'{starts.shape} to be swept, but failed: {type(error).__name__}: {error}'
-        ) from error
 
 
 def columns(setup: SweepSetup) -> tuple[str, ...]:

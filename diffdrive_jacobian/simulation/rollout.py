@@ -369,9 +369,15 @@ class Rollout:
         if len(robots.memory):
             more = {'state': robots.memory if equation else robots.memory.T}
             more['dt'] = 1.0 / loops.rate if step else 0.0
-        if equation is None:
-            return law(robots.pose.T, columns.goals.T, *columns.gains, **more)
-        found = equation(robots.pose, columns.goals, *columns.gains, **more)
+        try:
+            if equation is None:
+                return law(robots.pose.T, columns.goals.T, *columns.gains, **more)
+            found = equation(robots.pose, columns.goals, *columns.gains, **more)
+        except Exception as error:
+            raise ValueError(
+                f'the law of controller {loops.law.name!r} must accept poses of shape '
+                f'{robots.pose.T.shape}, but failed: {type(error).__name__}: {error}'
+            ) from error
         if not more:
             return found
         v, omega, state = found
