@@ -37,11 +37,14 @@ MOST, FEWEST = 5_000, 64
 """Number of poses of large and of small shapes."""
 LEAST_SIZE, GREATEST_SIZE = 1e-3, 1e5
 """Sizes of shapes (m)."""
-COLUMNS = {
-    **{'x': 'x', 'x_m': 'x', 'y': 'y', 'y_m': 'y', 'theta': 'theta', 'theta_rad': 'theta'},
-    **{'t': 't', 'time': 't', 'time_s': 't'},
+NAMES = {
+    'x': ('x', 'x_m'),
+    'y': ('y', 'y_m'),
+    'theta': ('theta', 'theta_rad'),
+    't': ('t', 'time', 'time_s'),
 }
-"""Names of the columns of a file, those of `plot_run --csv` included, to what they are."""
+"""Names of the columns of a file, also those of `plot_run --csv`."""
+COLUMNS = {name: column for column, names in NAMES.items() for name in names}
 UNNAMED = {2: ('x', 'y'), 3: ('x', 'y', 'theta'), 4: ('x', 'y', 'theta', 't')}
 
 

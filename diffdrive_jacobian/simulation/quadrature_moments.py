@@ -118,10 +118,14 @@ def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> 
         conjugate_u = decay * T * sum(map(mul, row, products))
         with_conjugate = z * (drift * conjugate_u - v * mean.conjugate())
         with_gamma = z * (drift * gamma_u - v * mean)
-        lost, double = expm1(-4.0 * m), z * z
-        xx += weight * ((with_conjugate + with_gamma).real + vv * (z.real**2 + lost * double.real / 2.0))
-        yy += weight * ((with_conjugate - with_gamma).real + vv * (z.imag**2 - lost * double.real / 2.0))
-        xy += weight * (with_gamma.imag + vv * (1.0 + lost) * double.imag / 2.0)
+        loss4, double = expm1(-4.0 * m), z * z
+        xx += weight * (
+            (with_conjugate + with_gamma).real + vv * (z.real**2 + loss4 * double.real / 2.0)
+        )
+        yy += weight * (
+            (with_conjugate - with_gamma).real + vv * (z.imag**2 - loss4 * double.real / 2.0)
+        )
+        xy += weight * (with_gamma.imag + vv * (1.0 + loss4) * double.imag / 2.0)
         square, product = square + weight * a, product + weight * b
     _, _, path, turn = piece.state(T)
     m = max(p * path + q * turn, 0.0) / (2.0 * L * L)
@@ -129,10 +133,17 @@ def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> 
     # E[gamma (exp(i psi) - 1)] and E[gamma* (exp(i psi) - 1)] at the end.
     a, b = decay * square * T - first, decay * product * T - first.conjugate()
     noise = NoiseMoments(
-        *(first.real, first.imag, max(xx, 0.0) * T, xy * T, max(yy, 0.0) * T),
-        *(of_psi.real, of_psi.imag),
-        *((a.real + b.real) / 2.0, (a.imag + b.imag) / 2.0),
-        *((a.imag - b.imag) / 2.0, (b.real - a.real) / 2.0),
+        x=first.real,
+        y=first.imag,
+        xx=max(xx, 0.0) * T,
+        xy=xy * T,
+        yy=max(yy, 0.0) * T,
+        xt=of_psi.real,
+        yt=of_psi.imag,
+        xc=(a.real + b.real) / 2.0,
+        xs=(a.imag + b.imag) / 2.0,
+        yc=(a.imag - b.imag) / 2.0,
+        ys=(b.real - a.real) / 2.0,
     )
     cosine, sine = cos(theta), sin(theta)
     g = complex(cosine, sine) * displacement * T

@@ -74,10 +74,7 @@ class Robot:
     _steady: Steady | None
     _ahead: tuple[int, _State] | None
     _knot: tuple[float, _State] | None
-    __slots__ = (
-        *('_ahead', '_command', '_commanded_at', '_drive', '_expiry'),
-        *('_knot', '_model', '_stamp', '_state', '_steady', '_twist'),
-    )
+    __slots__ = tuple(__annotations__)
 
     def __init__(
         self,
