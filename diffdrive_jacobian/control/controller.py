@@ -34,7 +34,6 @@ from diffdrive_jacobian.numerics.checks import (
     array,
     between,
     function,
-    number,
     numbers,
     optional,
     short,
@@ -329,12 +328,12 @@ class BoundLaw:
 
     def __call__(self, pose: Any, goal: Any) -> tuple[float, float]:
         """Return the twist."""
-        controller, goal = self.controller, goal[: self._size]
+        controller, goal, state = self.controller, goal[: self._size], self._state
         more: dict[str, Any] = {}
-        if self._state:
+        if state:
             # The clock may go back.
             dt = 0.0 if self._before is None else max(0, self.now - self._before) / NANOSECONDS
-            more = {'state': np.array(self._state), 'dt': dt}
+            more = {'state': list(state) if self._is_equation else np.array(state), 'dt': dt}
         try:
             if self._is_equation:
                 found = controller.law.floats(pose, goal, *self._values, **more)  # type: ignore[attr-defined]
@@ -344,22 +343,31 @@ class BoundLaw:
             raise LawError(
                 f'the law of controller {controller.name!r} failed: {_reason(error)}'
             ) from error
-        self._before = self.now
         try:
-            if self._state:
-                v, omega, state = found
-                self._state = numbers('state', state, len(self._state))
+            if state:
+                v, omega, after = found
+                state = tuple(map(_number, after))
+                if len(state) != len(self._state):
+                    raise ValueError(f'{len(state)} entries')
             else:
                 v, omega = found
-            if type(v) is type(omega) is float and isfinite(v) and isfinite(omega):
-                return v, omega
-            return number('v', v), number('omega', omega)
-        except (TypeError, ValueError) as error:
+            if not (type(v) is type(omega) is float and isfinite(v) and isfinite(omega)):
+                v, omega = _number(v), _number(omega)
+        except (OverflowError, TypeError, ValueError) as error:
             also = f', and the state, shape ({len(self._state)},)' if self._state else ''
             raise LawError(
                 f'the law of controller {controller.name!r} must return (v, omega), two finite '
                 f'numbers{also}, got {short(found)}'
             ) from error
+        self._before, self._state = self.now, state
+        return v, omega
+
+
+def _number(value: Any) -> float:
+    """Return what a law returns as a float: a finite number of any kind, also of other libraries."""
+    if isinstance(value, str) or np.shape(value) or not isfinite(value):
+        raise ValueError('not a finite number')
+    return float(value)
 
 
 def _reason(error: Exception) -> str:

@@ -6,6 +6,7 @@ document B's law the distance is measured from the offset point (doc/mathematics
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -112,7 +113,6 @@ class Waypoints:
         poses = array('poses', self.poses, 'n', 3)
         if poses.ndim != 2:
             raise ValueError(f'poses must have shape (n, 3), got {poses.shape}')
-        # Not copied again where the progress changes.
         object.__setattr__(self, 'poses', read_only(poses))
         index = integer('index', self.index, 0, len(poses) - 1)
         object.__setattr__(self, 'index', index)
@@ -157,7 +157,7 @@ class Waypoints:
         turning = self.turning or (stopped and arrival.use_heading)
         here = self
         if (index, turning) != (self.index, self.turning):
-            here = Waypoints(self.poses, index, turning)
+            here = self._progressed(index, turning)
         if not there:
             return here, law(pose, goal)
         if turning and not arrival.faces(theta, goal[2]):
@@ -200,4 +200,12 @@ class Waypoints:
 
         Needed when the law or the driven point changes while the robot turns in place.
         """
-        return Waypoints(self.poses, self.index) if self.turning else self
+        return self._progressed(self.index, False) if self.turning else self
+
+    def _progressed(self, index: int, turning: bool) -> Waypoints:
+        """Return the same poses, which are not checked and copied again."""
+        there = copy.copy(self)
+        object.__setattr__(there, 'index', index)
+        object.__setattr__(there, 'turning', turning)
+        object.__setattr__(there, '_goal', tuple(self.poses[index].tolist()))
+        return there

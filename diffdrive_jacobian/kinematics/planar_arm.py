@@ -119,7 +119,7 @@ class PlanarArm:
     @property
     def _two_links(self) -> int:
         if self.joints != 2:
-            raise ValueError(f'this is for an arm of 2 links, the arm has {self.joints}')
+            raise ValueError(f'the arm must have 2 links for this, got {self.joints}')
         return 2
 
     @formula('(joints) -> (k,2)')
@@ -186,14 +186,20 @@ class PlanarArm:
         stretched or folded. For a tip on the base, which any q_1 reaches, q_1 is 0. A position out of
         reach raises ValueError: its distance from the base must be from `|l_1 - l_2|` to `l_1 + l_2`.
         """
-        (l_1, l_2), (x, y) = self.lengths, np.moveaxis(self._reachable(position), -1, 0) + 0.0
+        return self._elbow_down_and_up(self._reachable(position))
+
+    @formula('(_two_links) -> (2,2)')
+    def _elbow_down_and_up(self, position: Vector) -> Rows:
+        (l_1, l_2), (x, y) = self._lengths, position
         c_2 = (x * x + y * y - l_1 * l_1 - l_2 * l_2) / (2.0 * l_1 * l_2)
         c_2 = maximum(minimum(c_2, 1.0), -1.0)  # only rounding is cut off
         s_2 = sqrt(1.0 - c_2 * c_2)
         bearing, inner = atan2(y, x), atan2(l_2 * s_2, l_1 + l_2 * c_2)
         q_2 = atan2(s_2, c_2)
-        down, up = [wrap(bearing - inner), q_2], [wrap(bearing + inner), -q_2]
-        return np.stack([np.stack(down, axis=-1), np.stack(up, axis=-1)], axis=-2)
+        return [
+            [wrap(bearing - inner), q_2],
+            [wrap(bearing + inner), -q_2],
+        ]
 
     def _reachable(self, position: ArrayLike) -> NDArray[np.float64]:
         """Require positions that the tip of two links can reach."""
@@ -207,7 +213,7 @@ class PlanarArm:
                 f'position must be from {least:g} to {most:g} m away from the base, '
                 f'got {position[beyond][0].tolist()}'
             )
-        return position
+        return position + 0.0  # without -0.0
 
     @formula('(_two_links),(2) -> (2)')
     def inverse_velocity(self, q: Vector, x_dot: Vector) -> Entries:

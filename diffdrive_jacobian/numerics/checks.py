@@ -18,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+import operator
 import sys
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -151,9 +152,13 @@ def integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
 
 def nanoseconds(name: str, value: Any) -> int:
     """Require a time or a duration, an integer that fits into 64 bits (ns)."""
-    if isinstance(value, bool) or not isinstance(value, Integral):
+    try:
+        time = operator.index(value)
+    except TypeError:
+        time = None
+    if time is None or type(value).__name__ in ('bool', 'bool_'):
         raise ValueError(f'{name} must be an integer number of nanoseconds (ns), got {short(value)}')
-    if not -MAX_NANOSECONDS <= (time := int(value)) <= MAX_NANOSECONDS:
+    if not -MAX_NANOSECONDS <= time <= MAX_NANOSECONDS:
         raise ValueError(f'{name} must fit into 64 bits (ns), got {short(value)}')
     return time
 
@@ -213,9 +218,12 @@ def number(name: str, value: Any, check: Check = finite) -> float:
 
 def _float(name: str, value: Any) -> float:
     """Return a single number of any kind as a float."""
-    if shape := getattr(value, 'shape', ()):
-        raise ValueError(f'{name} must be a single number, got shape {shape}')
-    value = value[()] if hasattr(value, 'ndim') else value
+    if hasattr(value, '__array__') and not isinstance(value, float):
+        value = value.__array__()
+        if value.shape:
+            raise ValueError(f'{name} must be a single number, got shape {value.shape}')
+        # Durations of NumPy count as integers.
+        value = value[()] if value.dtype.kind in 'iufO' else value
     if isinstance(value, bool) or not isinstance(value, Real):
         raise ValueError(f'{name} must be a number, got {short(value, repr)}')
     try:
@@ -359,11 +367,9 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def read_only(value: Any) -> Array:
-    """Return a read-only array, for immutable objects: a copy of one that may be written to."""
+    """Return a read-only copy of an array, for immutable objects."""
     import numpy as np
 
-    if type(value) is np.ndarray and value.base is None and not value.flags.writeable:
-        return value
     copy = np.array(value, dtype=np.float64)
     copy.setflags(write=False)
     return copy

@@ -83,40 +83,44 @@ def formula(signature: str, **checks: Check) -> _Decorator:
         @functools.wraps(body)
         def checked(*args: Any, **kwargs: Any) -> Any:
             try:
-                arguments = called.bind(*args, **kwargs).arguments
+                bound = called.bind(*args, **kwargs)
             except TypeError as error:
                 raise TypeError(f'{body.__name__}: {error}; it takes {given}') from None
-            owner: tuple[Any, ...] = (arguments.pop('self'),) if 'self' in arguments else ()
-            sizes: dict[Size, int] = {word: getattr(owner[0], word) for word in words}
+            arguments = bound.arguments
+            sizes: dict[Size, int] = {word: getattr(arguments['self'], word) for word in words}
+            arrays: dict[str, Array] = {}
             leads: dict[str, tuple[int, ...]] = {}
-            for name, value in list(arguments.items()):
+            for name, shape in shapes.items():
+                if name not in arguments:
+                    continue
+                value = arguments[name]
                 if value is None and name in optional:
                     del arguments[name]
                     continue
-                shape = shapes[name]
                 # The first argument with a letter decides on its size.
                 array = shaped(name, value, *(sizes.get(size, size) for size in shape))
                 checks.get(name, finite)(name, array)
                 axes = array.ndim - len(shape)
                 leads[name] = array.shape[:axes]
                 sizes |= zip(shape, array.shape[axes:], strict=True)
-                arguments[name] = array
+                arrays[name] = array
             batch = leading(**leads)
-            entries = {
-                name: entries_first(array, len(shapes[name]), len(batch))
-                if of_matrices
-                else _components(array, len(shapes[name]), batch)
-                for name, array in arguments.items()
-            }
+            for name, array in arrays.items():
+                arguments[name] = (
+                    entries_first(array, len(shapes[name]), len(batch))
+                    if of_matrices
+                    else _components(array, len(shapes[name]), batch)
+                )
             with np.errstate(all='ignore'):
                 try:
-                    results = body(*owner, **entries)
+                    results = body(*bound.args, **bound.kwargs)
                 except ArithmeticError:
                     raise ValueError(overflow) from None
                 except ValueError:
                     # Floats raise it where arrays become NaN: `sin(inf)`, `sqrt(-1)`. Mistakes in the
                     # body, and what it refuses, are raised again here.
-                    body(*owner, **{name: np.asarray(value) for name, value in entries.items()})
+                    arguments.update({name: np.asarray(arguments[name]) for name in arrays})
+                    body(*bound.args, **bound.kwargs)
                     raise ValueError(overflow) from None
             packed = [
                 _packed(result, shape, sizes, batch)

@@ -364,14 +364,15 @@ class Rollout:
     def _evaluate(self, step: int) -> Any:
         """Return what the law returns: an equation of components, or a function of arrays of poses."""
         loops, columns, robots = self.loops, self.columns, self.robots
-        law, more = loops.law.law, {}
+        law, more = loops.law.law, dict[str, Any]()
         equation = getattr(law, 'formula', None)
         if len(robots.memory):
-            more = {'state': robots.memory if equation else robots.memory.T}
+            more = {'state': list(robots.memory) if equation else np.array(robots.memory.T)}
             more['dt'] = 1.0 / loops.rate if step else 0.0
         try:
             if equation is None:
-                return law(robots.pose.T, columns.goals.T, *columns.gains, **more)
+                # A copy, which the law may keep or change.
+                return law(np.array(robots.pose).T, columns.goals.T, *columns.gains, **more)
             found = equation(robots.pose, columns.goals, *columns.gains, **more)
         except Exception as error:
             raise ValueError(

@@ -184,6 +184,8 @@ class Profile:
         self.begins = [0.0]
         for piece in pieces[:-1]:
             self.begins.append(self.begins[-1] + piece.seconds)
+        if not isfinite(self.begins[-1]):
+            raise ValueError('limits of the acceleration must be larger: a command is never reached')
 
     @property
     def final(self) -> Twist:

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 from diffdrive_jacobian.control import (
     Arrival,
+    Controller,
     VelocityLimits,
     Waypoints,
     go_to_goal,
@@ -203,6 +204,28 @@ def test_who_is_there_has_no_use_for_the_law_any_more():
     assert found.arrived.all()
     assert_allclose(found.time, np.maximum(-starts[:, 0] - 0.02, 0.0), atol=0.021)
     assert [field[0] for field in found[1:5]] == [0.0] * 4
+
+
+def test_a_law_may_keep_and_change_what_it_is_given():
+    """Poses, and what it remembers: neither moves the robots."""
+    kept = []
+
+    def law(poses, goals, state, dt):
+        kept.append(poses)
+        before = poses.copy()
+        poses[...] = 7.0
+        state[..., 0] += dt
+        return 0.1 + 0.0 * before[:, 0], state[:, 0] - dt, state
+
+    def plain(poses, goals, state, dt):
+        return 0.1 + 0.0 * poses[:, 0], state[:, 0], state + dt
+
+    own, same = (Controller(name='own', law=one, state=(0.0,), gains=()) for one in (law, plain))
+    for actuators in (None, Actuators(lag=0.1)):
+        arguments = np.zeros((2, 3)), np.ones((2, 2))
+        setting = {'duration': 0.5, 'actuators': actuators}
+        assert_same(closed_loops(own, *arguments, **setting), closed_loops(same, *arguments, **setting))
+    assert all((poses == 7.0).all() for poses in kept)
 
 
 def test_a_controller_without_gains_has_its_defaults():

@@ -6,6 +6,7 @@ import math
 import re
 import sys
 from dataclasses import fields, replace
+from decimal import Decimal
 from types import ModuleType
 
 import numpy as np
@@ -288,3 +289,8 @@ def test_invalid_controllers_and_gains_are_refused():
     for changes, words in INVALID_GAINS:
         with pytest.raises(ValueError, match=re.escape(words)):
             control.Gain(**{'name': 'ki', 'default': 1.0, 'bounds': (-1.0, 2.0)} | changes)
+
+
+def test_a_law_may_return_numbers_of_any_kind():
+    law = replace(MINE, law=lambda *_: (Decimal('0.5'), np.bool_(True)))
+    assert law.bind(GoToGoalParameters())((0.0, 0.0, 0.0), (1.0, 1.0, 0.0)) == (0.5, 1.0)

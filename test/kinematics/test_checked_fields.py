@@ -184,3 +184,28 @@ def test_a_value_does_not_change_with_the_array_it_was_given(make, name):
         getattr(value, name)[0] = 7.0
     with pytest.raises(FrozenInstanceError):
         setattr(value, name, given)
+
+
+def test_a_read_only_array_is_copied_as_well():
+    """Who owns it may write to it later."""
+    given = np.array([1.0, 0.5])
+    given.setflags(write=False)
+    arm = PlanarArm(given)
+    given.setflags(write=True)
+    given[0] = 99.0
+    assert arm.lengths.tolist() == [1.0, 0.5]
+
+
+class Scalar:
+    """A number of another library."""
+
+    def __array__(self, dtype=None, copy=None):
+        return np.array(0.5)
+
+
+def test_numbers_of_other_libraries_are_numbers_and_durations_are_none():
+    assert Slotted(y=Scalar()).y == Slotted(y=np.array(0.5)).y == 0.5
+    assert RobotModel(command_timeout=np.array(5)).command_timeout == 5
+    for bad in (np.timedelta64(3), np.array(True), np.array('1')):
+        with pytest.raises(ValueError, match='y must be a number'):
+            Slotted(y=bad)

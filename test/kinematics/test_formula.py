@@ -159,3 +159,12 @@ def test_a_method_may_be_an_equation():
         chain.turned([0.0, 1.0], 1.0)
     with pytest.raises(TypeError, match='it takes q and angle'):
         chain.turned([0.0, 1.0, 2.0])
+
+
+def test_arguments_may_be_positional_only():
+    @formula('(),() -> ()')
+    def total(x, y, /):
+        return x + y
+
+    assert total(1.0, 2.0) == 3.0
+    assert total([1.0, 2.0], 1.0).tolist() == [2.0, 3.0]

@@ -316,3 +316,9 @@ def test_a_heading_that_is_lost_at_once_takes_no_more_steps(monkeypatch):
     # The true heading is anything: the true position is about the start, k x / 4 for each axis.
     assert robot.covariance[0, 0] == pytest.approx(x * x + x / 4.0, rel=1e-3)
     assert len(steps) <= 32 * 40
+
+
+def test_a_command_that_is_never_reached_is_refused():
+    slow = AccelerationLimits(v=AxisLimits(max_acceleration=5e-324))
+    with pytest.raises(ValueError, match='limits of the acceleration must be larger'):
+        at_rest(acceleration=slow, lag=1.0).commanded((1e10, 0.0), 0)
