@@ -539,7 +539,7 @@ def _dynamics(values: Mapping[str, Any], faults: Iterable[str]) -> RobotModel:
     """Return a model from the parameters of a robot and the faults of its motors."""
     try:
         model = from_ros(VirtualRobotParameters, values).model()
-        actuators = model.actuators or Actuators()
+        actuators = model.actuators
         for fault in faults:
             for pattern, change in _MOTOR_FAULTS:
                 if (match := pattern.match(fault)) is not None:

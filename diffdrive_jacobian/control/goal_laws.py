@@ -31,9 +31,10 @@ def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Num
     """Compute the twist that drives a unicycle to a position.
 
     `e = wrap(atan2(y_g - y, x_g - x) - theta)`, `omega = Kp e`, `v = Kv d cos(e)`, where d is the
-    distance. Both gains are positive. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance
-    never grows. With `Kp <= Kv` the heading error does not converge to zero and the robot spirals in.
-    Exactly on the goal, where the heading towards it is undefined, v and omega are zero.
+    distance. Both gains should be positive, which is not checked. In continuous time `d_dot = -Kv d
+    cos^2(e) <= 0`, so the distance never grows. With `Kp < Kv` the heading error converges to the e with
+    `sin(2 e)/(2 e) = Kp/Kv`, not to zero, and the robot spirals in; with `Kp = Kv` it goes to zero like
+    1/sqrt(t). Exactly on the goal, where the heading towards it is undefined, v and omega are zero.
 
     Sampled at a rate, the robot arrives with `Kp < 2 rate` and `Kv < rate`; if commands take effect up
     to one sample late, with `Kp + Kv < rate`. Recommended is `Kp + Kv <= rate / 2` (doc/mathematics.md,
@@ -69,7 +70,8 @@ GO_TO_GOAL = Controller(
     law=go_to_goal,
     summary="document A's law, to a position",
     advice=_go_to_goal_advice,
-    # d omega / d theta, to which the bearing adds kv as the robot moves.
+    # |d omega / d theta| of the law, and kv, because driving changes the bearing by up to kv e per
+    # second.
     slope=lambda gains: gains.kp + gains.kv,
     boundary=Boundary(ratio=1.0, beyond='with a larger kv the robot spirals in'),
 )
@@ -80,8 +82,9 @@ def turn_in_place(theta: Number, heading: Number, Kp: Number) -> tuple[Number, N
     """Compute the twist that turns to a heading by the smaller angle.
 
     `v = 0`, `omega = Kp wrap(heading - theta)`, of headings (rad) and the gain Kp (1/s), each of shape
-    (...). When the law is sampled, it converges with `Kp < 2 rate`. If commands take effect up to one
-    sample late, it converges from rest with `Kp < rate`. Half of that is recommended.
+    (...); a negative gain, which is not refused, turns away. Sampled at a rate, it converges with `Kp <
+    2 rate`; if commands take effect up to one sample late, from rest with `Kp < rate`. (A robot that
+    turns already may swing about the opposite heading for ever.) Recommended is `Kp <= rate / 2`.
     """
     return 0.0, Kp * wrap(heading - theta)
 
@@ -99,9 +102,10 @@ def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Num
     As wheel speeds the law is `w = J_d^-1 k (goal - p_d)`. Here it is the body twist `u = J_w w`: `v = k
     a`, `omega = k b / d`, where `[a, b]` is the vector from the point to the goal in the body frame. The
     distance D of the point from the goal decays as exp(-k t), whatever the heading. The point comes to
-    rest on the goal, the axle centre at a distance |d| from it. Sampled at a rate, this holds for `k D <
-    2 |d| rate` and `k < rate`; if commands take effect up to one sample late, for `k (1 + D / |d|) <
-    rate`. With a shorter offset the robot turns too far when the goal is far away.
+    rest on the goal, the axle centre at a distance |d| from it. Sampled at a rate, it decays about so,
+    and the point arrives, with `k D < 2 |d| rate` and `k < rate`; if commands take effect up to one
+    sample late, with `k (1 + D / |d|) < rate`. With a shorter offset the robot turns too far when the
+    goal is far away.
 
     Args:
         state: Pose of the robot, shape (..., 3).
@@ -141,9 +145,8 @@ OFFSET_POINT = Controller(
 
 # --- To a position and a heading
 
-STEEPEST = 2.74
-"""Largest slope over alpha of `phi cos(alpha) sin(alpha) / alpha`, the part of `go_to_pose` with h, at
-the largest phi, pi [-]."""
+STEEPEST = 2.741
+"""pi times the largest slope of sin(2 alpha)/(2 alpha): that of the part of `go_to_pose` with h [-]."""
 
 
 @formula('(3),(3),(),(),() -> (),()', Kp=positive, Kv=positive, h=positive)
@@ -152,21 +155,23 @@ def go_to_pose(
 ) -> tuple[Number, Number]:
     """Compute the twist that drives a unicycle to a position and a heading.
 
-    In polar coordinates about the goal, with the distance rho, the bearing alpha of the goal relative to
-    the robot's heading, and the same bearing phi relative to the goal's heading, a unicycle moves as
+    Polar coordinates about the goal: the distance rho, and the direction b from the robot to the goal
+    relative to both headings, `alpha = wrap(b - theta)` and `phi = wrap(b - theta_goal)`. The heading
+    error `theta - theta_goal = phi - alpha` is zero where both are. A unicycle moves as
 
         rho_dot = -v cos(alpha),  alpha_dot = v sin(alpha) / rho - omega,  phi_dot = v sin(alpha) / rho
 
     The law is `v = Kv rho cos(alpha)`, as in document A's law, and `omega = Kp alpha + Kv cos(alpha)
-    sin(alpha)/alpha (alpha + h phi)`. Exactly on the goal's position, where the bearing is undefined, v
-    and omega are zero.
+    sin(alpha)/alpha (alpha + h phi)`, in which h weights phi. In continuous time `V = rho^2 + alpha^2 +
+    h phi^2` never grows, as `V_dot = -2 Kv rho^2 cos^2(alpha) - 2 Kp alpha^2`, and all three converge to
+    zero. Exactly on the goal's position, where b is undefined, v and omega are zero, with any heading:
+    then `turn_in_place` turns to it.
 
-    In continuous time `V = rho^2 + alpha^2 + h phi^2` never grows, as `V_dot = -2 Kv rho^2 cos^2(alpha)
-    - 2 Kp alpha^2`, and all three converge to zero. Near the goal `rho_dot = -Kv rho`, `alpha_dot = -Kp
-    alpha - Kv h phi` and `phi_dot = Kv alpha`: bearing and heading are an oscillator of frequency `Kv
-    sqrt(h)`, which Kp damps. The heading converges before the distance if Kp is above 2 Kv. A weight h
-    larger than necessary leads to longer paths. If the goal lies behind, the robot backs up while it
-    turns to it and then drives forwards; if it may not back up, it turns first.
+    Near the goal `rho_dot = -Kv rho`, `alpha_dot = -Kp alpha - Kv h phi` and `phi_dot = Kv alpha`. So
+    alpha and phi oscillate with the frequency `Kv sqrt(h)`, damped by Kp. They converge before rho with
+    `Kp > 2 Kv` and `h > Kp/Kv - 1`, which the default h is. A larger h leads to longer paths. If the
+    goal lies behind, the robot backs up while it turns to it and then drives forwards; if it may not
+    back up, it turns first.
 
     Sampled at a rate, with `Kp > 2 Kv`, the robot arrives with `K = Kp + Kv (1 + 2.74 h) < 2 rate`; if
     commands take effect up to one sample late, with `K < rate`. Recommended is `K <= rate / 2`. With the
@@ -235,7 +240,7 @@ def without_whole_turns(omega: Any, rate: float) -> Any:
     """Return a yaw rate without the whole turns per sample. The heading at the next sample is the same.
 
     A robot that makes a whole turn per sample drives a circle back to where it was, and never arrives.
-    omega (rad/s) of shape (...), sampled at a rate (Hz), is left as it is up to `LARGEST_TURN`, 7/8 of a
-    turn, which leaves room for the turns that are near to a whole one.
+    omega (rad/s) of shape (...), sampled at a rate (Hz), is left as it is up to `LARGEST_TURN`: turns
+    from 7/8 to a whole one are nearly as bad.
     """
     return where(abs(omega) <= LARGEST_TURN * rate, omega, wrap(omega / rate) * rate)

@@ -28,7 +28,7 @@ from diffdrive_jacobian.numerics.checks import (
     number,
     one_of,
 )
-from diffdrive_jacobian.simulation.actuators import Actuators, time_constant
+from diffdrive_jacobian.simulation.actuators import time_constant
 from diffdrive_jacobian.simulation.encoders import MAX_PER_REVOLUTION
 from diffdrive_jacobian.simulation.robot import RobotModel
 from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
@@ -133,7 +133,7 @@ class ActuatorLag(RobotFault):
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Set the lag of the motors."""
         return robot.defects.change(
-            lambda model: replace(model, actuators=_actuators(model).lagging(self.seconds))
+            lambda model: replace(model, actuators=model.actuators.lagging(self.seconds))
         )
 
     def reaction_delay(self, node: Node, since: float, now: float) -> float:
@@ -238,10 +238,6 @@ def _drift(model: RobotModel) -> Drift:
     return model.drift or Drift()
 
 
-def _actuators(model: RobotModel) -> Actuators:
-    return model.actuators or Actuators()
-
-
 def _saturating(wheel: str, speed: float) -> Callable[[RobotModel], RobotModel]:
     """Return a change of the model that limits the speed of a wheel (rad/s)."""
-    return lambda model: replace(model, actuators=_actuators(model).weakened(wheel, speed))
+    return lambda model: replace(model, actuators=model.actuators.weakened(wheel, speed))

@@ -15,7 +15,8 @@ Everything broadcasts over leading axes. A radius or separation that is not posi
 angle or speed that is not finite, shapes that do not broadcast, and terms or results that overflow raise
 ValueError, in single and in batched calls.
 
-Source: document A, equations (4)-(8); documents B and E; doc/mathematics.md, "Differential drive".
+Source: document A, on the mobile robot's Jacobian, equations (4)-(8); B, slides on mobile robots; E, on
+a differential drive by rolling constraints (doc/documents.md); doc/mathematics.md, "Differential drive".
 """
 
 from __future__ import annotations
@@ -186,9 +187,9 @@ def wheel_to_body(omega_R: Number, omega_L: Number, r: Number, L: Number) -> tup
 def wheel_centres(pose: Vector, L: Number) -> Rows:
     """Return the centres of both wheels: `C_R = C + L/2 e_l`, `C_L = C - L/2 e_l` (E).
 
-    C is the axle centre, the position of the pose, and `e_l = [sin, -cos]` points to the right. For
-    poses, shape (..., 3), and L, shape (...) (m), the result is `[[x_R, y_R], [x_L, y_L]]`, shape (...,
-    2, 2) (m). Document E has them as `C_2` and `C_1`.
+    C is the axle centre, the position of the pose, and `e_l = [sin, -cos]` document E's lateral unit
+    vector, which points to the right. For poses, shape (..., 3), and L, shape (...) (m), the result is
+    `[[x_R, y_R], [x_L, y_L]]`, shape (..., 2, 2) (m). Document E has them as `C_2` and `C_1`.
     """
     x, y, theta = pose
     return [
@@ -199,10 +200,11 @@ def wheel_centres(pose: Vector, L: Number) -> Rows:
 
 @formula('(),(3),() -> (2,2)', L=positive)
 def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
-    """Return the velocities of the centres of both wheels: `v_C ± L/2 theta_dot e_f` (E).
+    """Return the velocities of the centres of both wheels: right `v_C + L/2 theta_dot e_f`, left `-`
+    (E).
 
-    They are `v_C + theta_dot k × CC_i` with the vertical k, the vectors `CC_i = ± L/2 e_l` from the axle
-    centre C, and `k × e_l = e_f = [cos, sin]`. Their mean is the velocity of C. Of wheels that roll
+    With the forward unit vector `e_f = [cos, sin]`; this is `v_C` and the angular velocity times the
+    vector from the axle centre C to the wheel. Their mean is the velocity of C. Of wheels that roll
     without slip they are `r omega_R e_f` and `r omega_L e_f`.
 
     For headings theta, shape (...) (rad), velocities `q_dot = [x_dot, y_dot, theta_dot]` in the world,
@@ -231,10 +233,11 @@ def no_lateral_slip_constraint(theta: Number) -> Rows:
 def lie_bracket(theta: Number) -> Entries:
     """Return the Lie bracket of the columns of S(theta): `[g_1, g_2] = [sin, -cos, 0]`.
 
+    `g_1 = [cos, sin, 0]` drives, `g_2 = [0, 0, 1]` turns, and `[g_1, g_2] = dg_2/dq g_1 - dg_1/dq g_2`.
     Driving `a` forward, turning by `b`, driving back and turning back moves the robot by `a b [g_1,
-    g_2]`, to second order, as in parallel parking (A, 3.2.2): along the direction that
-    `no_lateral_slip_constraint` forbids. `[g_1, g_2] = dg_2/dq g_1 - dg_1/dq g_2`. For headings theta,
-    shape (...) (rad), it has the shape (..., 3).
+    g_2]` plus terms of third order, as in parallel parking (A, 3.2.2): along the direction that
+    `no_lateral_slip_constraint` forbids. For headings theta, shape (...) (rad), it has the shape
+    (..., 3).
 
     Source: doc/mathematics.md, "Controllability".
     """
@@ -246,9 +249,9 @@ def lie_bracket(theta: Number) -> Entries:
 def controllability_matrix(theta: Number) -> Rows:
     """Return the columns `g_1, g_2, [g_1, g_2]`, of which g_1 and g_2 are those of S(theta).
 
-    Its rank is 3 for every heading theta, shape (...) (rad), so a unicycle reaches every pose (A, 3.2.2:
-    controllability is preserved). This is the Lie algebra rank condition. Shape (..., 3, 3), determinant
-    1.
+    (Not Kalman's matrix `[B, AB, ...]` of linear systems.) Its determinant is 1 for every heading theta,
+    shape (...) (rad): three independent directions. So a robot that may drive both ways reaches every
+    pose, by Chow's theorem (A, 3.2.2: controllability is preserved). Shape (..., 3, 3).
 
     Source: W.-L. Chow, "Über Systeme von linearen partiellen Differentialgleichungen erster Ordnung",
     1939; doc/mathematics.md, "Controllability".
@@ -263,8 +266,8 @@ def rolling_constraints(theta: Number, r: Number, L: Number) -> tuple[Rows, Rows
     """Return the constraints of two rolling wheels, a pair with `A_q q_dot = A_w w` (E).
 
     Rows: no lateral slip, pure rolling of the right wheel, pure rolling of the left one. `A_q` is
-    invertible, and `A_q^-1 A_w` is the chain `S(theta) J_w`. For headings theta (rad), r and L (m), each
-    of shape (...), they have the shapes (..., 3, 3) and (..., 3, 2).
+    invertible, its determinant is -L, and `A_q^-1 A_w` is the chain `S(theta) J_w`. For headings theta
+    (rad), r and L (m), each of shape (...), they have the shapes (..., 3, 3) and (..., 3, 2).
     """
     A_q = [
         [sin(theta), -cos(theta), 0.0],

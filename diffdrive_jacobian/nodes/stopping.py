@@ -16,20 +16,18 @@ LEAST_SHARE = 0.02
 """A gain that is a smaller share of the present one is not recommended."""
 
 
-def rolls_on(
-    actuators: Actuators | None, twist: tuple[float, float], wheels: Wheels | None = None
-) -> str:
+def rolls_on(actuators: Actuators, twist: tuple[float, float], wheels: Wheels | None = None) -> str:
     """Describe how far a robot rolls after a zero command, to be appended to a sentence.
 
     Args:
-        actuators: How it follows commands, as far as that is known. None: at once.
+        actuators: How it follows commands, as far as that is known.
         twist: Its twist `(v, omega)` (m/s, rad/s).
         wheels: Its wheels; None: the limit of their acceleration is left out.
 
     Returns:
         The description. Empty: it stops at once, or nothing is known.
     """
-    if actuators is None or actuators.immediate or not math.isfinite(sum(twist)):
+    if actuators.immediate or not math.isfinite(sum(twist)):
         return ''
     distance, turn = actuators.stopping_distance(twist, wheels)
     if max(abs(distance), abs(turn)) < NEGLIGIBLE:

@@ -9,16 +9,17 @@
     unicycle_jacobian(0.5)          # an array of shape (3, 2)
     unicycle_jacobian([0.5, 0.6])   # of shape (2, 3, 2)
 
-The signature has the shapes of arguments and results, as that of NumPy's generalized universal
-functions: `()` is a number, `(3)` a vector of three entries, `(3,2)` a matrix. A letter is a size that
-arguments and results have in common. In a method a word is an attribute: `(joints)` has the size
-`self.joints`. Before these axes arguments may have others, which broadcast, and which the results have,
-too. An argument whose default is None may be missing.
+The signature has the shapes of arguments and results: `()` is a number, `(3)` a vector, `(3,2)` a
+matrix. In `(m,n),(n) -> (m)` a single letter is a size that is the same wherever it appears. A longer
+name, as in `(joints) -> (3)`, is for methods only and means `self.joints`. Arguments may have further
+axes in front, those of a batch: they broadcast, and results have them in front, too. An argument whose
+default is None may be missing.
 
 The body is written for one robot: a number is a float, a vector a list of floats, and it returns
 numbers, lists of numbers, or matrices as lists of rows. For a batch the same body is evaluated once,
-with arrays in place of the floats. They broadcast to the shape of the batch, so the body uses the
-functions of `numerics.elementary`.
+with arrays in place of the floats, which broadcast to the shape of the batch. So it uses the functions
+of `numerics.elementary`: `where(x > 0, a, b)` instead of `if x > 0`, and `[2 * a for a in p]` instead of
+`2 * p`, which repeats a list.
 
 If any argument is a matrix, all arguments are arrays with their entries first, also for one robot:
 
@@ -26,9 +27,10 @@ If any argument is a matrix, all arguments are arrays with their entries first, 
     def task_velocity(J, q_dot):    # shapes (m, n, ...) and (n, ...)
         return np.einsum('mn...,n...->m...', J, q_dot)
 
-Bad arguments raise a ValueError with the name of the argument, a result that overflows one with the
-names of all. The body without these checks is `formula` of the decorated function, for callers whose
-numbers are checked. `floats` is the same for floats alone, for what runs for every message.
+A bad argument raises a ValueError with its name, a missing one a TypeError, and a result that is
+infinite or undefined a ValueError with the names of all arguments. The body without these checks is
+`formula` of the decorated function, for callers whose numbers are checked. `floats` is the same for
+floats alone, for what runs for every message.
 """
 
 from __future__ import annotations
@@ -76,9 +78,13 @@ def formula(signature: str, **checks: Check) -> _Decorator:
         called = inspect.signature(body)
         shapes = dict(zip((name for name in called.parameters if name != 'self'), inputs, strict=True))
         optional = {name for name in shapes if called.parameters[name].default is None}
+        if words and 'self' not in called.parameters:
+            raise TypeError(
+                f'{body.__name__}: {", ".join(sorted(words))}: sizes by name are for methods'
+            )
         *others, last = shapes
         given = f'{", ".join(others)} and {last}' if others else last
-        overflow = f'{given} must give a finite result, but it overflows'
+        overflow = f'{given} must give a finite result, but it overflows or is undefined'
 
         @functools.wraps(body)
         def checked(*args: Any, **kwargs: Any) -> Any:
@@ -117,8 +123,9 @@ def formula(signature: str, **checks: Check) -> _Decorator:
                 except ArithmeticError:
                     raise ValueError(overflow) from None
                 except ValueError:
-                    # Floats raise it where arrays become NaN: `sin(inf)`, `sqrt(-1)`. Mistakes in the
-                    # body, and what it refuses, are raised again here.
+                    # Floats raise where arrays become NaN, as in `math.sin(inf)`. With arrays a mistake
+                    # in the body is raised again, and what it refuses. If nothing is, the result is
+                    # undefined.
                     arguments.update({name: np.asarray(arguments[name]) for name in arrays})
                     body(*bound.args, **bound.kwargs)
                     raise ValueError(overflow) from None
@@ -133,7 +140,7 @@ def formula(signature: str, **checks: Check) -> _Decorator:
             return tuple(packed) if len(outputs) > 1 else packed[0]
 
         def floats(*args: Any, **kwargs: Any) -> Any:
-            # Made when it is called first: the body may call what is defined after it.
+            # Replaces itself when it is called first: the body may call what is defined after it.
             if checked.floats is floats:  # type: ignore[attr-defined]
                 checked.floats = for_floats(body)  # type: ignore[attr-defined]
             return checked.floats(*args, **kwargs)  # type: ignore[attr-defined]
@@ -160,13 +167,13 @@ def _components(array: Array, entries: int, batch: tuple[int, ...]) -> Any:
 
 
 def entries_first(array: Array, entries: int, axes: int) -> Array:
-    """Move the axes of entries, so many, to the front, before the axes of the batch."""
+    """Move the last axes, as many as `entries`, to the front, before the axes of the batch."""
     padded = array.reshape((1,) * (axes + entries - array.ndim) + array.shape)
     return np.asarray(padded.transpose(*range(axes, padded.ndim), *range(axes)), order='C')
 
 
 def entries_last(array: Array, entries: int) -> Array:
-    """Move the axes of entries, so many, behind those of the batch."""
+    """Move the first axes, as many as `entries`, behind those of the batch."""
     return np.asarray(array.transpose(*range(entries, array.ndim), *range(entries)), order='C')
 
 
@@ -176,6 +183,7 @@ def _packed(
     """Return a number, or the entries of a vector or a matrix (a list of rows), as one array."""
     found: tuple[int, ...] = (len(result),) if shape else ()
     if len(shape) > 1:
+        # Rows of different lengths give several sizes, which are refused below.
         found = *found, *sorted({len(row) for row in result})
     # A letter that no argument has is any size.
     wanted = tuple(sizes.get(size, size) for size in shape)

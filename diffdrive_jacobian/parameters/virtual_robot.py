@@ -110,14 +110,13 @@ class VirtualRobotParameters(WheelParameters):
             actuators=self.actuators(),
         )
 
-    def actuators(self) -> Actuators | None:
-        """Return how commands are followed; None: at once."""
-        actuators = Actuators(
+    def actuators(self) -> Actuators:
+        """Return how commands are followed."""
+        return Actuators(
             acceleration=self.acceleration_limits(),
             lag=self.wheel_lag,
             delay=nanoseconds(self.command_delay),
         )
-        return None if actuators.immediate else actuators
 
     def drift(self) -> Drift | None:
         """Return in what the true motion differs from the odometry; None: in nothing."""

@@ -9,7 +9,6 @@ import numpy as np
 
 from diffdrive_jacobian.control.controller import KP, KV, Boundary, Gain
 from diffdrive_jacobian.plots.rendering import render, styled
-from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 __all__ = ['draw', 'figure']
@@ -81,7 +80,7 @@ def figure(swept: Sweep) -> Figure:
 
 def describe(setup: SweepSetup) -> str:
     """Return two lines about the settings of a sweep, three for a robot that takes time."""
-    limits, actuators = setup.robot.limits, setup.robot.actuators or Actuators()
+    limits, actuators = setup.robot.limits, setup.robot.actuators
     v, omega = actuators.acceleration.v, actuators.acceleration.omega
     wheels = actuators.acceleration.max_wheel_acceleration
     bounds, accelerations = (

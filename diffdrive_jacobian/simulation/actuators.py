@@ -5,8 +5,9 @@ A commanded twist `u = [v, omega]` passes
 1. the delay;
 2. the limits of the acceleration, those of diff_drive_controller, but with one time law s(t) from 0 to 1
    for both speeds, `u(t) = u_0 + (u_1 - u_0) s(t)`, so that the curvature is kept;
-3. the largest speed of each motor, which the robot does not know: the curvature is not kept;
-4. the lag of both wheels, `tau du/dt = u_demanded - u`.
+3. the largest speed of each motor, which the robot does not know: the curvature is not kept; 4. the lag,
+`tau du/dt = u_reached - u`, with what step 3 leaves: that of both wheels, and so of v and omega,
+   which are linear in the wheel speeds.
 
 So v and omega are `a + b t + c exp(-t / tau)` in each piece of time (`speeds`).
 
@@ -57,13 +58,13 @@ class AxisLimits(Checked):
     """
 
     max_acceleration: PositiveOrInfinite = math.inf
-    """Forwards, positive."""
+    """Speeding up forwards, positive."""
     max_deceleration: NegativeOrInfinite = -math.inf
-    """Forwards, negative."""
+    """Slowing down forwards, negative."""
     max_acceleration_reverse: NegativeOrInfinite = -math.inf
-    """Backwards, negative."""
+    """Speeding up backwards, negative."""
     max_deceleration_reverse: PositiveOrInfinite = math.inf
-    """Backwards, positive."""
+    """Slowing down backwards, positive: the speed rises to zero."""
 
     def rate(self, speed: Number, change: Number) -> Number:
         """Return the largest rate, as a positive number, of a change with the sign of `change`."""
@@ -104,12 +105,15 @@ class AccelerationLimits(Checked):
         target: Vector,
         wheel_speeds: Callable[[Number, Number], Vector] | None = None,
     ) -> Iterator[tuple[Number, Vector]]:
-        """Yield the three parts of the fastest transition `u_0 + (u_1 - u_0) s(t)` to a target.
+        """Yield the parts of the fastest transition to a target on the straight line from u_0 to u_1.
 
-        s is linear in time in each part. The parts end where v or omega is zero, where other limits
-        begin to apply, and at the target; some may be empty. Twists are those of one robot, of floats,
-        or of many, of arrays. `wheel_speeds` maps a twist to the wheel speeds (rad/s), linearly; None:
-        the limit of the wheels is left out.
+        s is linear in time in each part. A part ends where v changes its sign, at `s = -v_0/dv`, and its
+        limit changes from that of slowing down to that of speeding up; likewise omega. So there are
+        three, of which some may be empty. From (1, 0) to (-1, 2), with v slowing down at 0.2 and
+        speeding up at 1 m/s^2 and omega at 0.5 rad/s^2, they take 5 s, 2 s and nothing.
+
+        Twists are those of one robot, of floats, or of many, of arrays. `wheel_speeds` maps a twist to
+        the wheel speeds (rad/s), linearly; None: the limit of the wheels is left out.
 
         Yields:
             The duration of each part, and the twist at its end. A jump, where there is no limit, and
@@ -123,6 +127,7 @@ class AccelerationLimits(Checked):
         for s_end in (minimum(v_zero, omega_zero), maximum(v_zero, omega_zero), 1.0):
             v_end = where(s_end == v_zero, 0.0, v_0 + dv * s_end)
             omega_end = where(s_end == omega_zero, 0.0, omega_0 + domega * s_end)
+            # 1.0 also stands for a speed that does not change its sign: the end is the target.
             v_end, omega_end = where(s_end == 1.0, v_1, v_end), where(s_end == 1.0, omega_1, omega_end)
             # The time for s from 0 to 1 at the rates of this part, in the middle of which no speed is
             # zero; where there is no limit, none.
@@ -179,7 +184,7 @@ def time_constant(name: str, value: object, words: str = '') -> float:
 def _lag(name: str, value: object) -> float:
     """Require zero or a time constant (s)."""
     seconds = number(name, value, not_negative)
-    return seconds and time_constant(name, seconds, '0 or ')
+    return time_constant(name, seconds, '0 or ') if seconds else seconds
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -202,6 +207,18 @@ class Actuators(Checked):
     """Limits of the acceleration."""
     delay: Duration = 0
     """Time from a command to its effect on the motors (ns)."""
+    immediate: bool = field(init=False, repr=False, compare=False)
+    """Whether a command takes no time: a weak motor may still not reach it."""
+    weak: bool = field(init=False, repr=False, compare=False)
+    """Whether a motor has a largest speed."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        Checked.__post_init__(self)
+        immediate = not self.lag and not self.delay and self.acceleration.unlimited
+        object.__setattr__(self, 'immediate', immediate)
+        weak = min(self.max_right_speed, self.max_left_speed) < math.inf
+        object.__setattr__(self, 'weak', weak)
 
     def lagging(self, seconds: float) -> Actuators:
         """Return actuators whose lag is at least a time constant (s)."""
@@ -212,11 +229,6 @@ class Actuators(Checked):
         one_of('right', 'left')('wheel', wheel)
         name = f'max_{wheel}_speed'
         return replace(self, **{name: min(speed, getattr(self, name))})
-
-    @property
-    def immediate(self) -> bool:
-        """Whether a command takes no time: a weak motor may still not reach it."""
-        return not self.lag and not self.delay and self.acceleration.unlimited
 
     def limited(self, speeds: Speeds) -> Speeds:
         """Return the speeds that the motors can reach."""
@@ -235,27 +247,36 @@ class Actuators(Checked):
         """
         wheel_speeds = None if wheels is None else wheels.wheel_speeds
         parts = self.acceleration.transition(twist, STANDSTILL, wheel_speeds)
+        # No speed changes its sign, so both fall linearly: their mean is half.
         seconds = self.reaction + sum(duration for duration, _ in parts) / 2.0
         v, omega = twist
         return v * seconds, omega * seconds
 
     @property
     def reaction(self) -> float:
-        """Time for which a robot rolls on, as far as a stop goes, because of lag and delay (s)."""
+        """Delay and tau: as far as in this time at the old speed a robot rolls on because of both
+        (s).
+        """
         return self.delay / NANOSECONDS + self.lag
 
     def reached(self, twist: Twist, wheels: Wheels) -> Twist:
         """Return the twist that the motors reach when one is demanded."""
+        if not self.weak:
+            return twist
         demanded = wheels.wheel_speeds(*twist)
         reached = self.limited(demanded)
         return twist if reached == demanded else wheels.twist(*reached)
+
+
+IDEAL = Actuators()
+"""They follow every command at once."""
 
 
 class Drive(NamedTuple):
     """How the speeds of a robot go on from an event, if there are no further ones."""
 
     demanded: Profile
-    """The twist within the limits of the acceleration."""
+    """The twist after the delay and the limits of the acceleration, before the largest speeds."""
     motion: Profile
     """The twist of the robot."""
 
@@ -268,9 +289,9 @@ class Drive(NamedTuple):
     def followed(self, stamp: int, target: Twist, actuators: Actuators, wheels: Wheels) -> Drive:
         """Return how the speeds go on from a time (ns) when another target is commanded.
 
-        During the delay the demand stays what it was. The motors may differ from those so far: their
-        largest speeds and their lag are the new ones at once, the limits of the acceleration after the
-        delay, with the target.
+        During the delay the old plan goes on, with its ramps and the commands under way. Then the new
+        ramp begins. The motors may differ from those so far: their largest speeds and their lag are the
+        new ones at once, the limits of the acceleration after the delay.
         """
         now = self.demanded.seconds(stamp)
         then = self.demanded.seconds(stamp + actuators.delay)
@@ -278,7 +299,7 @@ class Drive(NamedTuple):
         after = ramp(self.demanded.twist(then), target, actuators.acceleration, wheels)
         demanded = [*until_then, *after]
         motion = demanded
-        if actuators.max_right_speed < math.inf or actuators.max_left_speed < math.inf:
+        if actuators.weak:
             motion = list(_saturated(demanded, actuators, wheels))
         if actuators.lag:
             here = self.motion.twist(self.motion.seconds(stamp))

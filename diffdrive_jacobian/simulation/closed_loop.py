@@ -19,7 +19,7 @@ from diffdrive_jacobian.control.controller import Controller, Law
 from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import function
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.actuators import IDEAL, Actuators
 from diffdrive_jacobian.simulation.rollout import NO_LIMITS, Array, Keep, Loops, Outcomes, Rollout, Rows
 
 BLOCK = 8192
@@ -56,7 +56,7 @@ def closed_loops(
     limits: VelocityLimits = NO_LIMITS,
     r: ArrayLike = 0.033,
     L: ArrayLike = 0.16,
-    actuators: Actuators | None = None,
+    actuators: Actuators = IDEAL,
     progress: Callable[[int], object] | None = None,
     on_step: Callable[[int], object] | None = None,
 ) -> Outcomes:
@@ -78,7 +78,7 @@ def closed_loops(
         r: Wheel radius, shape (...) (m).
         L: Wheel separation, shape (...) (m).
         actuators: How all robots follow commands: limits of the acceleration, lag and delay. A robot
-            that has arrived then rolls on until it is at rest. None: at once.
+            that has arrived then rolls on until it is at rest. By default they follow at once.
         progress: Called from time to time with the number of robots that are finished.
         on_step: Called with that number at every step of every block of robots. An exception that it
             raises ends the batch and is passed on.

@@ -423,8 +423,8 @@ class Robot:
     ) -> Robot:
         """Return the robot in a state, from now on following a command within the limits, `target`."""
         actuators = model.actuators
-        if actuators is None or actuators.immediate:
-            twist = target if actuators is None else actuators.reached(target, model)
+        if actuators.immediate:
+            twist = actuators.reached(target, model) if actuators.weak else target
             drive = self._drive
             if drive is not None and not (model.drift and drive.motion.holds(twist, stamp)):
                 drive = None

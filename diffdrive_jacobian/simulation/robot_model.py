@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
 from diffdrive_jacobian.numerics.checks import Checked, NotNegative, Positive, instance, pair
-from diffdrive_jacobian.simulation.actuators import Actuators, Duration, Speeds
+from diffdrive_jacobian.simulation.actuators import IDEAL, Actuators, Duration, Speeds
 from diffdrive_jacobian.simulation.odometry_noise import spectral_densities
 from diffdrive_jacobian.simulation.slip import Drift
 
@@ -59,8 +59,8 @@ class RobotModel(Checked):
     """k, variance of each wheel's travel per distance travelled (m)."""
     drift: Drift | None = None
     """In what the true motion differs from the odometry; None: in nothing."""
-    actuators: Actuators | None = None
-    """In what the wheel motors differ from ideal ones; None: in nothing."""
+    actuators: Actuators = IDEAL
+    """How the wheel motors carry out commands."""
 
     def limited(self, command: ArrayLike) -> tuple[float, float]:
         """Saturate a command `(v, omega)`, shape (2,), keeping its curvature.
@@ -88,7 +88,7 @@ class RobotModel(Checked):
     @property
     def takes_time(self) -> bool:
         """Whether commands are not followed at once."""
-        return self.actuators is not None and not self.actuators.immediate
+        return not self.actuators.immediate
 
     @property
     def radii(self) -> tuple[float, float]:

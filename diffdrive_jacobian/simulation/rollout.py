@@ -28,7 +28,7 @@ from diffdrive_jacobian.numerics.checks import (
     positive,
 )
 from diffdrive_jacobian.numerics.elementary import dot, hypot, wrap
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.actuators import IDEAL, Actuators
 from diffdrive_jacobian.simulation.batch_actuators import Follower
 
 Array = NDArray[np.float64]
@@ -83,16 +83,14 @@ def _arrival(name: str, value: Any) -> Arrival:
     return arrival
 
 
-def _actuators(name: str, value: Any) -> Actuators | None:
-    """Require actuators whose motors are fast enough; None: commands are followed at once."""
-    if value is None:
-        return None
+def _actuators(name: str, value: Any) -> Actuators:
+    """Require actuators whose motors are fast enough."""
     actuators: Actuators = instance(name, value, Actuators)
-    if min(actuators.max_right_speed, actuators.max_left_speed) < math.inf:
+    if actuators.weak:
         raise ValueError(
             f'{name} must have no max_right_speed or max_left_speed: in batches no motor saturates'
         )
-    return None if actuators.immediate else actuators
+    return actuators
 
 
 class Columns(NamedTuple):
@@ -137,7 +135,7 @@ class Loops(Checked):
     limits: VelocityLimits = NO_LIMITS
     r: Any = 0.033
     L: Any = 0.16
-    actuators: Annotated[Actuators | None, _actuators] = None
+    actuators: Annotated[Actuators, _actuators] = IDEAL
     shape: tuple[int, ...] = field(init=False)
     """Shape of the batch."""
     columns: Columns = field(init=False)
@@ -262,7 +260,7 @@ class Rollout:
         self.loops, self.columns = loops, loops.columns.some(rows)
         self.robots = Robots.at_starts(rows, self.columns, loops.law.state)
         self.follower: Follower | None = None
-        if loops.actuators is not None:
+        if not loops.actuators.immediate:
             self.follower = Follower(loops.actuators, len(rows), loops.rate)
 
     def drive(

@@ -106,17 +106,17 @@ class Truth:
 
     def after(self, motion: Profile, begin: int, end: int, L: float, k: float) -> Truth:
         """Return the truth after a nominal motion from `begin`, the present time, to `end` (ns)."""
-        slips = self._drift.seed is not None and k > 0.0
         time, pose, cell = begin, self.pose, self._cell
+        if self._drift.seed is None or not k:
+            for piece, _ in motion.steps(motion.seconds(begin), motion.seconds(end)):
+                pose = moved(pose, self._rims(piece, L).mapped(self._to_twist(L)))
+            return Truth(self._drift, pose)
         if self._ahead is not None and self._ahead[0] is motion and self._ahead[1] <= end:
             _, time, pose = self._ahead
             cell = None
         while time < end:
-            settled = time >= motion.settled_at
-            # Wheels at rest slip only to the end of the cell in which they stopped.
-            if settled and not (slips and (cell or motion.final != STANDSTILL)):
-                for piece in motion.between(motion.seconds(time), motion.seconds(end)):
-                    pose = moved(pose, self._rims(piece, L).mapped(self._to_twist(L)))
+            if cell is None and motion.holds(STANDSTILL, time):
+                # Wheels at rest slip only to the end of the cell in which they stopped.
                 break
             cell = _present(cell, motion, time)
             pose, there = self._in_cell(cell, pose, motion, time, min(cell.end, end), L, k)

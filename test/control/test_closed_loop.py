@@ -221,7 +221,7 @@ def test_a_law_may_keep_and_change_what_it_is_given():
         return 0.1 + 0.0 * poses[:, 0], state[:, 0], state + dt
 
     own, same = (Controller(name='own', law=one, state=(0.0,), gains=()) for one in (law, plain))
-    for actuators in (None, Actuators(lag=0.1)):
+    for actuators in (Actuators(), Actuators(lag=0.1)):
         arguments = np.zeros((2, 3)), np.ones((2, 2))
         setting = {'duration': 0.5, 'actuators': actuators}
         assert_same(closed_loops(own, *arguments, **setting), closed_loops(same, *arguments, **setting))

@@ -204,7 +204,7 @@ def test_the_elbow_moves_and_damping_bounds_the_joints():
         (
             ('arm_ellipses', '--lengths', '1', '1', '1'),
             2,
-            'the arm must have 2 links, the arm has 3',
+            'the arm must have 2 links for this, got 3',
         ),
         (('geometry', '--ros-args'), 2, 'plot_jacobian takes no ROS arguments'),
         (('geometry', '-o', 'none/a.png'), 1, 'none/a.png cannot be written: No such file or directory'),

@@ -123,7 +123,7 @@ def numbers(result):
     if isinstance(result, Outcomes):
         assert np.all(np.isnan(result.time) == ~result.arrived)
         result = result._replace(time=np.nan_to_num(result.time))
-    if isinstance(result, (VelocityLimits, Arrival)):
+    if isinstance(result, (VelocityLimits, Arrival, simulation.Actuators)):
         return  # infinite limits mean none
     if dataclasses.is_dataclass(result):
         result = [getattr(result, field.name) for field in dataclasses.fields(result)]

@@ -14,6 +14,7 @@ import pytest
 from diffdrive_jacobian.control import Arrival, StraightLine, VelocityLimits
 from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+from diffdrive_jacobian.numerics import checks
 from diffdrive_jacobian.numerics.checks import (
     Checked,
     Count,
@@ -140,6 +141,18 @@ def test_checks_that_need_no_numpy(check, valid, invalid, allowed):
         got = 'an object of class int' if value == 10**5000 else repr(value)
         with pytest.raises(ValueError, match=f'^{re.escape(f"x must be {allowed}, got {got}")}$'):
             check('x', value)
+
+
+@pytest.mark.parametrize(
+    'check',
+    [
+        *(checks.finite, checks.positive, checks.positive_or_infinite, checks.not_negative),
+        *(checks.not_negative_or_infinite, checks.offset, checks.semidefinite, checks.anything),
+    ],
+)
+def test_a_check_returns_the_value(check):
+    value = np.ones((3, 3)) + np.eye(3)
+    assert check('x', value) is value
 
 
 # --- Values with arrays

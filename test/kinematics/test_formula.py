@@ -132,9 +132,9 @@ def test_mistakes_in_a_body_are_not_called_an_overflow():
 def test_the_equation_for_floats_may_be_made_in_a_function_and_kept():
     gain = 2.0
 
-    @formula('() -> ()')
-    def scaled_sine(x):
-        return gain * sin(x)
+    @formula('(),() -> ()')
+    def scaled_sine(x, *, turns=0.0):
+        return gain * sin(x + turns)
 
     floats = scaled_sine.floats
     assert floats(0.5) == floats(0.5) == scaled_sine(0.5) == 2.0 * np.sin(0.5)

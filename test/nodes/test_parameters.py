@@ -161,7 +161,7 @@ def test_limits_follow_diff_drive_controller():
     limits = VirtualRobotParameters(linear_x_max_velocity=0.3, angular_z_min_velocity=-1.0).limits()
     assert (limits.min_v, limits.max_v) == (-0.3, 0.3)
     assert (limits.min_omega, limits.max_omega) == (-1.0, math.inf)
-    assert VirtualRobotParameters(linear_x_max_deceleration=-1.0).model().actuators is None
+    assert VirtualRobotParameters(linear_x_max_deceleration=-1.0).model().actuators.immediate
     given = VirtualRobotParameters(linear_x_max_acceleration=0.5).acceleration_limits().v
     assert (given.max_acceleration, given.max_deceleration) == (0.5, -0.5)
     assert (given.max_acceleration_reverse, given.max_deceleration_reverse) == (-0.5, 0.5)
