@@ -79,9 +79,7 @@ def formula(signature: str, **checks: Check) -> _Decorator:
         shapes = dict(zip((name for name in called.parameters if name != 'self'), inputs, strict=True))
         optional = {name for name in shapes if called.parameters[name].default is None}
         if words and 'self' not in called.parameters:
-            raise TypeError(
-                f'{body.__name__}: {", ".join(sorted(words))}: sizes by name are for methods'
-            )
+            raise TypeError(f'a size by a name, {min(words)!r}, is for methods, got {body.__name__}')
         *others, last = shapes
         given = f'{", ".join(others)} and {last}' if others else last
         overflow = f'{given} must give a finite result, but it overflows or is undefined'

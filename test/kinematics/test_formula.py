@@ -168,3 +168,11 @@ def test_arguments_may_be_positional_only():
 
     assert total(1.0, 2.0) == 3.0
     assert total([1.0, 2.0], 1.0).tolist() == [2.0, 3.0]
+
+
+def test_sizes_by_a_name_are_for_methods():
+    with pytest.raises(TypeError, match="a size by a name, 'joints', is for methods, got arm"):
+
+        @formula('(joints) -> ()')
+        def arm(q):
+            return sum(q)
