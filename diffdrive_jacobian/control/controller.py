@@ -31,7 +31,6 @@ from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import (
     Checked,
     Finite,
-    array,
     between,
     function,
     numbers,
@@ -79,7 +78,7 @@ class Gain(Checked):
     def __post_init__(self) -> None:
         """Check every field."""
         Checked.__post_init__(self)
-        if not isinstance(self.name, str) or not _GAIN.fullmatch(self.name) or iskeyword(self.name):
+        if not _GAIN.fullmatch(self.name) or iskeyword(self.name):
             raise ValueError(
                 'name of a gain must be a lower-case letter, then lower-case letters, digits or _, at '
                 f'most 32, got {short(repr(self.name))}'
@@ -87,9 +86,12 @@ class Gain(Checked):
         low, high = numbers('bounds', self.bounds, 2)
         object.__setattr__(self, 'bounds', (low, high))
         self.check(self.default)
-        if self.usual == ():
+        if isinstance(self.usual, tuple) and not self.usual:
             about = sorted((self.default / 10.0, 3.0 * self.default)) if self.default else [low, high]
-            object.__setattr__(self, 'usual', (max(low, about[0]), min(high, about[1])))
+            first, last = max(low, about[0]), min(high, about[1])
+            if self.above is not None and first <= self.above:
+                first = self.default
+            object.__setattr__(self, 'usual', (first, last))
         first, last = numbers('usual', self.usual, 2)
         if not first < last:
             raise ValueError(f'usual must be (first, last) with first < last, got {self.usual}')
@@ -176,7 +178,7 @@ class ControlLaw(Checked):
     def __post_init__(self) -> None:
         """Check every field."""
         Checked.__post_init__(self)
-        if not isinstance(self.name, str) or not _NAME.fullmatch(self.name):
+        if not _NAME.fullmatch(self.name):
             raise ValueError(
                 "name of a controller must be a letter, then letters, digits, '_', '.' or '-', "
                 f'at most 64, got {short(repr(self.name))}'
@@ -186,8 +188,7 @@ class ControlLaw(Checked):
         names = self.gain_names
         if len(set(names)) < len(names):
             raise ValueError(f'gains must have different names, got {", ".join(names)}')
-        state = array('state', self.state, 'n') if self.state else np.zeros(0)
-        object.__setattr__(self, 'state', tuple(state.tolist()))
+        object.__setattr__(self, 'state', numbers('state', self.state, np.size(self.state)))
 
     @property
     def gain_names(self) -> tuple[str, ...]:

@@ -83,17 +83,21 @@ class PathFollower:
         path = self.path
         s = path.nearest(x, y, self.s, forward=True)
         nearest = path.at(s, 0.0)
-        if far := hypot(nearest.x - x, nearest.y - y) > how.approach_distance:
+        far = hypot(nearest.x - x, nearest.y - y) > how.approach_distance
+        if far:
             # On the way to the path there is no progress along it.
             s = self.s
         here = replace(self, s=s, index=self._next(x, y, s, how.waypoint_tolerance))
         if here.passing and s > path.arc_lengths[here.index] + how.waypoint_tolerance:
             return here, None
-        at_end = s >= path.length - how.end_tolerance
-        if self.elapsed + dt >= path.duration or (at_end and path.times is None):
+        elapsed = self.elapsed + dt
+        if path.times is None:
+            over = s >= path.length - how.end_tolerance
+        else:
+            over, elapsed = elapsed >= path.duration, min(elapsed, path.duration)
+        if over:
             if self.passing:
                 return here, None
-            elapsed = min(self.elapsed + dt, path.duration)
             return replace(here, index=len(path.poses) - 1, elapsed=elapsed), None
         reference = here.reference(how)
         away = hypot(reference.x - x, reference.y - y)

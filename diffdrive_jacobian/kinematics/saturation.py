@@ -124,7 +124,8 @@ def scaled_to_limits(
     v_excess = v / (v_limit + (v_limit == 0.0))
     omega_excess = omega / (omega_limit + (omega_limit == 0.0))
     wheel_excess = (abs(v) + abs(omega * L / 2.0)) / r / max_wheel_speed
-    excess = maximum(1.0, v_excess, omega_excess, wheel_excess)
+    # First the one that may be NaN, which then remains also among floats.
+    excess = maximum(wheel_excess, v_excess, omega_excess, 1.0)
     if not all_finite(excess):
         raise ValueError('v, omega, the limits, r and L must give finite speeds, but they overflow')
     v, omega = v / excess, omega / excess

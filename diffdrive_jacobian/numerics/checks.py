@@ -261,6 +261,8 @@ def inside(value: Any, low: float, high: float, above: float | None = None) -> b
 
 def interval(low: float, high: float, above: float | None = None) -> str:
     """Return the range of `between` in words."""
+    if above is not None and above < low:
+        above = None
     ends = low if above is None else above, high
     first, last = (str(end) if isinstance(end, int) else f'{end:g}' for end in ends)
     if high == math.inf:

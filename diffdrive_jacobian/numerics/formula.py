@@ -78,6 +78,8 @@ def formula(signature: str, **checks: Check) -> _Decorator:
         called = inspect.signature(body)
         shapes = dict(zip((name for name in called.parameters if name != 'self'), inputs, strict=True))
         optional = {name for name in shapes if called.parameters[name].default is None}
+        if unknown := checks.keys() - shapes.keys():
+            raise TypeError(f'checks must be of {", ".join(shapes)}, got {", ".join(sorted(unknown))}')
         if words and 'self' not in called.parameters:
             raise TypeError(f'a size by a name, {min(words)!r}, is for methods, got {body.__name__}')
         *others, last = shapes

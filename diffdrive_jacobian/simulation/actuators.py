@@ -35,7 +35,7 @@ from diffdrive_jacobian.numerics.checks import (
 from diffdrive_jacobian.numerics.elementary import maximum, minimum, where
 from diffdrive_jacobian.numerics.formula import Number, Vector
 from diffdrive_jacobian.simulation.speeds import STANDSTILL as STANDSTILL
-from diffdrive_jacobian.simulation.speeds import Piece, Profile, Twist
+from diffdrive_jacobian.simulation.speeds import Course, Piece, Profile, Twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 SHORTEST = 1e-9
@@ -310,7 +310,7 @@ class Drive(NamedTuple):
 def held(twist: Twist) -> Piece:
     """Return a twist that is held for ever."""
     v, omega = twist
-    return Piece(math.inf, (v, 0.0, 0.0), (omega, 0.0, 0.0))
+    return Piece(math.inf, Course(v), Course(omega))
 
 
 def ramp(start: Twist, target: Twist, limits: AccelerationLimits, wheels: Wheels) -> Iterator[Piece]:
@@ -323,7 +323,7 @@ def ramp(start: Twist, target: Twist, limits: AccelerationLimits, wheels: Wheels
 
 
 def _line(start: Twist, end: Twist, seconds: float) -> Piece:
-    v, omega = ((a, (b - a) / seconds, 0.0) for a, b in zip(start, end, strict=True))
+    v, omega = (Course(a, (b - a) / seconds) for a, b in zip(start, end, strict=True))
     return Piece(seconds, v, omega)
 
 
@@ -355,16 +355,17 @@ def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece
     """
     for piece in pieces:
         v, omega = (
-            (a - b * tau, b, 0.0 if _is_close(u, a - b * tau) else u - (a - b * tau))
-            for (a, b, _), u in zip((piece.v, piece.omega), here, strict=True)
+            Course(a - b * tau, b, 0.0 if _is_close(u, a - b * tau) else u - (a - b * tau), tau)
+            for (a, b, *_), u in zip((piece.v, piece.omega), here, strict=True)
         )
         begin = 0.0
-        if v[2] or omega[2]:
-            lagging = Piece(min(piece.seconds, SETTLING * tau), v, omega, tau)
+        if v.c or omega.c:
+            lagging = Piece(min(piece.seconds, SETTLING * tau), v, omega)
             yield lagging
             begin, here = lagging.seconds, lagging.twist(lagging.seconds)
         if begin < piece.seconds:
-            line = Piece(math.inf, (*v[:2], 0.0), (*omega[:2], 0.0)).part(begin, piece.seconds)
+            line = Piece(math.inf, Course(v.a, v.b), Course(omega.a, omega.b))
+            line = line.part(begin, piece.seconds)
             yield line
             if piece.seconds < math.inf:
                 here = line.twist(line.seconds)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.kinematics.se2 import exp
 from diffdrive_jacobian.simulation.actuators import SETTLING, Actuators
-from diffdrive_jacobian.simulation.speeds import QUADRATURES, Piece
+from diffdrive_jacobian.simulation.speeds import QUADRATURES, Course, Piece
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Array = NDArray[np.float64]
@@ -119,8 +119,9 @@ def _of(
     seconds: Array, speed: Array, slope: Array, rest: Array | float = 0.0, tau: float = 0.0
 ) -> Piece:
     """Return the pieces with the twists `speed + slope t + rest exp(-t / tau)`."""
-    v, omega = zip(speed, slope, np.broadcast_to(rest, speed.shape), strict=True)
-    return Piece(seconds, v, omega, tau)
+    rests = np.broadcast_to(rest, speed.shape)
+    v, omega = (Course(*terms, tau) for terms in zip(speed, slope, rests, strict=True))
+    return Piece(seconds, v, omega)
 
 
 def _steps(rows: Rows, pieces: Piece) -> Iterator[tuple[Rows, Array, Array]]:
@@ -129,24 +130,22 @@ def _steps(rows: Rows, pieces: Piece) -> Iterator[tuple[Rows, Array, Array]]:
     step = pieces.seconds / count
     for number in range(int(count.max())):
         some = count > number
-        v, omega = (tuple(term[some] for term in course) for course in (pieces.v, pieces.omega))
+        v, omega = (Course(a[some], b[some], c[some], tau) for a, b, c, tau in (pieces.v, pieces.omega))
         begin = number * step[some]
-        part = Piece(step[some], v, omega, pieces.tau).part(begin, begin + step[some])
+        part = Piece(step[some], v, omega).part(begin, begin + step[some])
         yield rows[some], *_integrals(part)
 
 
 def _integrals(pieces: Piece) -> tuple[Array, Array]:
     """Integrate a step of each piece, as `Follower.advance` yields it."""
-    seconds = pieces.seconds
+    (seconds, v, omega), nodes = pieces, QUADRATURE.nodes
     sums: Array = np.zeros((3, len(seconds)))
-    if not pieces.tau and not np.any([pieces.v[1], pieces.omega[1]]):
-        v, omega = pieces.twist(seconds)
-        sums += np.array([np.abs(v), v * v, omega * omega]) * seconds
-        return np.array(exp.formula((v * seconds, 0.0, omega * seconds))), sums
+    if not v.tau and not np.any([v.b, omega.b]):
+        sums += np.array([np.abs(v.a), v.a * v.a, omega.a * omega.a]) * seconds
+        return np.array(exp.formula((v.a * seconds, 0.0, omega.a * seconds))), sums
     displacement: Array = np.zeros((2, len(seconds)))
-    for node, weight in QUADRATURE.nodes:
-        v, omega, _, turn = pieces.state(node * seconds)
-        displacement += weight * v * np.array([np.cos(turn), np.sin(turn)])
-        sums += weight * np.array([np.abs(v), v * v, omega * omega])
-    _, _, _, turn = pieces.state(seconds)
-    return np.array([*(displacement * seconds), turn]), sums * seconds
+    for node, weight in nodes:
+        (speed, rate), turn = pieces.twist(node * seconds), omega.travelled(node * seconds)
+        displacement += weight * speed * np.array([np.cos(turn), np.sin(turn)])
+        sums += weight * np.array([np.abs(speed), speed * speed, rate * rate])
+    return np.array([*(displacement * seconds), omega.travelled(seconds)]), sums * seconds

@@ -118,7 +118,10 @@ def trajectories(
 
     Arguments and errors are those of `closed_loops`, without `progress` and `on_step`.
     """
-    loops = Loops(law=law, starts=starts, goals=goals, gains=gains, **settings)  # type: ignore[arg-type]
+    try:
+        loops = Loops(law=law, starts=starts, goals=goals, gains=gains, **settings)  # type: ignore[arg-type]
+    except TypeError as error:
+        raise TypeError(str(error).replace('Loops.__init__', 'trajectories')) from None
     count = loops.columns.starts.shape[1]
     if (loops.steps + 1) * count > MAX_SAMPLES:
         raise ValueError(
@@ -159,7 +162,7 @@ def _drive(
         try:
             state = {'state': np.array(loops.law.state), 'dt': 0.0} if loops.law.state else {}
             loops.law.law(columns.starts.T, columns.goals.T, *columns.gains, **state)
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise ValueError(f'law rejects the starts, goals and gains: {error}') from error
     count = loops.columns.starts.shape[1]
     found = Outcomes(

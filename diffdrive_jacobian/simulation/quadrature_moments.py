@@ -24,7 +24,7 @@ from diffdrive_jacobian.simulation.exact_moments import (
     propagated_moments,
 )
 from diffdrive_jacobian.simulation.odometry_noise import spectral_densities
-from diffdrive_jacobian.simulation.speeds import Piece, sign_changes, travelled
+from diffdrive_jacobian.simulation.speeds import Course, Piece
 
 MAX_NOISE = 0.25
 """Largest m of a step of the quadrature."""
@@ -39,17 +39,12 @@ def moments_along(
 
     `theta` is the heading at the start (rad), L the wheel separation (m), k as of `odometry_noise` (m).
     """
-    rims = piece.mapped(((1.0, L / 2.0), (1.0, -L / 2.0)))
-    right, left = rims.v, rims.omega
-    turns = (*sign_changes(right, dt, piece.tau), *sign_changes(left, dt, piece.tau))
-    knots = [0.0, *sorted(turns), dt]
+    right, left = piece.rims(L)
+    knots = [0.0, *sorted([*right.sign_changes(dt), *left.sign_changes(dt)]), dt]
     found: Entries | None = moments
     try:
         for begin, end in pairwise(knots):
-            distance = sum(
-                abs(travelled(rim, end, piece.tau) - travelled(rim, begin, piece.tau))
-                for rim in (right, left)
-            )
+            distance = sum(abs(rim.travelled(end) - rim.travelled(begin)) for rim in (right, left))
             count = max(1, min(math.ceil(k * distance / (2.0 * L * L) / MAX_NOISE), MOST_STEPS))
             lost = k * distance / (2.0 * L * L) > MOST_STEPS * MAX_NOISE
             for number in range(count):
@@ -60,7 +55,7 @@ def moments_along(
                 if lost:
                     # The heading is not known any more, however it was driven.
                     step = _evenly(step)
-                found = _after(found, theta + travelled(piece.omega, first, piece.tau), step, L, k)
+                found = _after(found, theta + piece.omega.travelled(first), step, L, k)
     except (OverflowError, ValueError):
         return None
     return found if found is not None and all(map(isfinite, found)) else None
@@ -68,9 +63,8 @@ def moments_along(
 
 def _evenly(piece: Piece) -> Piece:
     """Return a piece with the same path and turn at constant speeds."""
-    _, _, path, turn = piece.state(piece.seconds)
-    v, omega = path / piece.seconds, turn / piece.seconds
-    return Piece(piece.seconds, (v, 0.0, 0.0), (omega, 0.0, 0.0))
+    v, omega = (one.travelled(piece.seconds) / piece.seconds for one in (piece.v, piece.omega))
+    return Piece(piece.seconds, Course(v), Course(omega))
 
 
 def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> Entries | None:
@@ -91,7 +85,8 @@ def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> 
     firsts, squares, products = [], [], []
     displacement = first = of_psi = 0j
     for node, weight in nodes:
-        v, omega, path, turn = piece.state(node * T)
+        v, omega = piece.twist(node * T)
+        path, turn = piece.v.travelled(node * T), piece.omega.travelled(node * T)
         m = max(p * path + q * turn, 0.0) / (2.0 * L * L)
         vw = (r * v + s * omega) / (2.0 * L)
         half, loss = 0.5j * vw, expm1(-m)
@@ -127,7 +122,7 @@ def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> 
         )
         xy += weight * (with_gamma.imag + vv * (1.0 + loss4) * double.imag / 2.0)
         square, product = square + weight * a, product + weight * b
-    _, _, path, turn = piece.state(T)
+    path, turn = piece.v.travelled(T), piece.omega.travelled(T)
     m = max(p * path + q * turn, 0.0) / (2.0 * L * L)
     first, of_psi, decay = first * T, of_psi * T, exp(-m)
     # E[gamma (exp(i psi) - 1)] and E[gamma* (exp(i psi) - 1)] at the end.

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from math import inf, isfinite
 from operator import attrgetter
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,9 +45,18 @@ from diffdrive_jacobian.simulation.speeds import Piece, Pose, Profile, Twist, ar
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 _CERTAIN = read_only(np.zeros((3, 3)))
-_State: TypeAlias = tuple[Pose, Speeds, Entries | None, Truth | None]
-"""Pose, wheel angles, moments of the error of the pose and truth at a time. Moments None: they have
-overflowed. Truth None: the pose is the true one."""
+
+
+class State(NamedTuple):
+    """What is known of a robot at a time."""
+
+    pose: Pose
+    wheel_angles: tuple[float, float]
+    """Right, left (rad)."""
+    moments: Entries | None
+    """Moments of the error of the pose; None: they have overflowed."""
+    truth: Truth | None
+    """None: the pose is the true one."""
 
 
 def _field(name: str, doc: str) -> Any:
@@ -65,15 +74,15 @@ class Robot:
 
     _model: RobotModel
     _stamp: int
-    _state: _State
+    _state: State
     _command: Twist
     _twist: Twist
     _commanded_at: int | None
     _expiry: int | None
     _drive: Drive | None
     _steady: Steady | None
-    _ahead: tuple[int, _State] | None
-    _knot: tuple[float, _State] | None
+    _ahead: tuple[int, State] | None
+    _knot: tuple[float, State] | None
     __slots__ = tuple(__annotations__)
 
     def __init__(
@@ -106,14 +115,14 @@ class Robot:
         commanded, applied = pair('command', command), pair('twist', twist)
         if commanded_at is not None:
             commanded_at = nanoseconds('commanded_at', commanded_at)
-        state = place, angles, moments, _truth(model, place)
+        state = State(place, angles, moments, _truth(model, place))
         self._start(model, stamp, state, commanded, applied, commanded_at)
 
     def _start(
         self,
         model: RobotModel,
         stamp: int,
-        state: _State,
+        state: State,
         command: Twist,
         twist: Twist,
         commanded_at: int | None = None,
@@ -160,7 +169,9 @@ class Robot:
         '_commanded_at', 'Time at which the command took effect (ns); None: it is zero.'
     )
     target: Twist = _field(
-        '_twist', 'The twist to reach: the command after saturation, as far as the motors reach it.'
+        '_twist',
+        'The twist to reach: the command within the velocity limits, and of a robot that follows '
+        'at once as far as its motors reach it.',
     )
     expiry: int | None = _field(
         '_expiry',
@@ -170,12 +181,12 @@ class Robot:
     @property
     def pose(self) -> NDArray[np.float64]:
         """`[x, y, theta]`, shape (3,), read-only. `pose_tuple` has the same numbers without an array."""
-        return read_only(self._state[0])
+        return read_only(self._state.pose)
 
     @property
     def pose_tuple(self) -> Pose:
         """`(x, y, theta)`, the pose as floats (m, m, rad)."""
-        return self._state[0]
+        return self._state.pose
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -197,7 +208,7 @@ class Robot:
         Raises:
             ValueError: The covariance overflows.
         """
-        xx, xy, xt, yy, yt, tt, *_ = self._finite_moments()
+        xx, xy, xt, yy, yt, tt, *_ = self._state.moments or self._finite_moments()
         return xx, xy, xt, xy, yy, yt, xt, yt, tt
 
     @property
@@ -210,7 +221,7 @@ class Robot:
         return Moments(*self._finite_moments())
 
     def _finite_moments(self) -> Entries:
-        moments = self._state[2]
+        moments = self._state.moments
         if moments is None:
             raise ValueError('twist and time must give a finite result, but it overflows')
         return moments
@@ -218,7 +229,7 @@ class Robot:
     @property
     def wheel_angles(self) -> Speeds:
         """`(right, left)`, unwrapped (rad)."""
-        return self._state[1]
+        return self._state.wheel_angles
 
     @property
     def twist(self) -> Twist:
@@ -235,8 +246,8 @@ class Robot:
     @property
     def true_pose_tuple(self) -> Pose:
         """`(x, y, theta)` of the true pose (m, m, rad); without drift that of the odometry."""
-        pose, _, _, truth = self._state
-        return pose if truth is None else truth.pose
+        truth = self._state.truth
+        return self._state.pose if truth is None else truth.pose
 
     @property
     def true_pose(self) -> NDArray[np.float64]:
@@ -246,7 +257,7 @@ class Robot:
     @property
     def true_twist(self) -> Twist:
         """The true twist `(v, omega)` from this time on, the slip included (m/s, rad/s)."""
-        truth, drive = self._state[3], self._drive
+        truth, drive = self._state.truth, self._drive
         if truth is None or drive is None:
             return self.twist
         L, k = self._model.wheel_separation, self._model.wheel_travel_variance
@@ -327,11 +338,11 @@ class Robot:
             ValueError: The pose or the covariance is invalid, as in the constructor; or as `at`.
         """
         here = self.at(stamp)
-        _, angles, _, truth = here._state
         place, moments = triple('pose', pose), tuple(gaussian(covariance))
+        state = here._state._replace(pose=place, moments=moments)
         if not odometry_only:
-            truth = _truth(self._model, place)
-        return here._with(here._stamp, (place, angles, moments, truth))
+            state = state._replace(truth=_truth(self._model, place))
+        return here._with(here._stamp, state)
 
     def reported(self, pose: Pose, wheel_angles: Speeds, twist: Twist) -> Robot:
         """Return this robot as its sensors report it, with the same covariance and the same truth.
@@ -339,8 +350,9 @@ class Robot:
         Raises:
             ValueError: An argument has another shape or is not finite.
         """
-        _, _, moments, truth = self._state
-        state = triple('pose', pose), pair('wheel_angles', wheel_angles), moments, truth
+        state = self._state._replace(
+            pose=triple('pose', pose), wheel_angles=pair('wheel_angles', wheel_angles)
+        )
         twist = pair('twist', twist)
         return object.__new__(Robot)._start(
             self._model, self._stamp, state, self._command, twist, self._commanded_at
@@ -367,9 +379,9 @@ class Robot:
         if noticed:
             seen = compose(here.pose_tuple, displacement)
             here = here.placed(seen, here.covariance, here._stamp, odometry_only=True)
-        pose, angles, moments, truth = here._state
+        truth = here._state.truth
         truth = None if truth is None else truth.moved(moved)
-        return here._with(here._stamp, (pose, angles, moments, truth))
+        return here._with(here._stamp, here._state._replace(truth=truth))
 
     def remodelled(self, model: RobotModel, stamp: int, *, wheels_commanded: bool = False) -> Robot:
         """Change the model. Its limits and timeout apply to the current command.
@@ -386,12 +398,12 @@ class Robot:
         if wheels_commanded:
             command = model.twist(*self._model.wheel_speeds(*command))
         limited = model.limited(command)
-        pose, angles, moments, truth = here._state
+        truth = here._state.truth
         if truth is None or model.drift is None:
-            truth = _truth(model, pose)
+            truth = _truth(model, here._state.pose)
         else:
             truth = truth.with_drift(model.drift)
-        state = pose, angles, moments, truth
+        state = here._state._replace(truth=truth)
         return here._following(model, here._stamp, state, command, limited, here._commanded_at)
 
     def restarted(self, stamp: int) -> Robot:
@@ -401,13 +413,11 @@ class Robot:
             ValueError: The time is not an integer (ns).
         """
         stamp = nanoseconds('stamp', stamp)
-        pose, angles, moments, truth = self._state
-        truth = None if truth is None else truth.at_rest()
-        return object.__new__(Robot)._start(
-            self._model, stamp, (pose, angles, moments, truth), STANDSTILL, STANDSTILL
-        )
+        truth = self._state.truth
+        state = self._state._replace(truth=None if truth is None else truth.at_rest())
+        return object.__new__(Robot)._start(self._model, stamp, state, STANDSTILL, STANDSTILL)
 
-    def _with(self, stamp: int, state: _State) -> Robot:
+    def _with(self, stamp: int, state: State) -> Robot:
         """Return the robot in another state, with the same motion."""
         motion = self._command, self._twist, self._commanded_at, self._drive, self._steady
         return object.__new__(Robot)._start(self._model, stamp, state, *motion)
@@ -416,7 +426,7 @@ class Robot:
         self,
         model: RobotModel,
         stamp: int,
-        state: _State,
+        state: State,
         command: Twist,
         target: Twist,
         commanded_at: int | None,
@@ -433,7 +443,7 @@ class Robot:
         drive = drive.followed(stamp, target, actuators, model)
         return object.__new__(Robot)._start(model, stamp, state, command, target, commanded_at, drive)
 
-    def _advanced(self, stamp: int) -> tuple[int, Robot, _State]:
+    def _advanced(self, stamp: int) -> tuple[int, Robot, State]:
         """Return a time (ns), the robot after its last event before it, and the state at that time.
 
         Raises:
@@ -449,7 +459,7 @@ class Robot:
             robot = self._following(self._model, expiry, state, STANDSTILL, STANDSTILL, None)
         return stamp, robot, robot._state_at(stamp)
 
-    def _state_at(self, stamp: int) -> _State:
+    def _state_at(self, stamp: int) -> State:
         """Compute the state at a time up to the timeout."""
         if self._ahead is not None and self._ahead[0] == stamp:
             return self._ahead[1]
@@ -465,7 +475,7 @@ class Robot:
         self._ahead = stamp, state
         return state
 
-    def _driven(self, motion: Profile, stamp: int) -> _State:
+    def _driven(self, motion: Profile, stamp: int) -> State:
         """Compute the state at a time up to the timeout, along a motion."""
         time, end = motion.seconds(self._stamp), motion.seconds(stamp)
         state = self._state
@@ -476,13 +486,13 @@ class Robot:
                 # The state may be asked for again at a later time.
                 self._knot = time, state
             state, time = self._after_step(state, piece), limit
-        truth = self._state[3]
+        truth = self._state.truth
         if truth is not None:
             L, k = self._model.wheel_separation, self._model.wheel_travel_variance
             truth = truth.after(motion, self._stamp, stamp, L, k)
-        return *state[:3], truth
+        return state._replace(truth=truth)
 
-    def _after_step(self, state: _State, piece: Piece) -> _State:
+    def _after_step(self, state: State, piece: Piece) -> State:
         """Compute the state after a step of a drive; the truth is left out."""
         model, dt = self._model, piece.seconds
         if piece.constant:
@@ -490,15 +500,14 @@ class Robot:
             return state if twist == STANDSTILL else _after_arc(state, twist, model.steady(twist), dt)
         pose, (right, left), moments, truth = state
         L, k = model.wheel_separation, model.wheel_travel_variance
-        _, _, path, turn = piece.state(dt)
-        turned_R, turned_L = model.wheel_speeds(path, turn)
+        turned_R, turned_L = model.wheel_speeds(piece.v.travelled(dt), piece.omega.travelled(dt))
         if moments is not None:
             moments = moments_along(moments, pose[2], piece, dt, L, k)
         pose = displaced(pose, piece.displacement(dt))
-        return pose, (right + turned_R, left + turned_L), moments, truth
+        return State(pose, (right + turned_R, left + turned_L), moments, truth)
 
 
-def _after_arc(state: _State, twist: Twist, steady: Steady, dt: float) -> _State:
+def _after_arc(state: State, twist: Twist, steady: Steady, dt: float) -> State:
     """Compute the state after a time (s) with a constant twist; the truth is left out."""
     pose, angles, moments, truth = state
     omega_R, omega_L = steady.wheel_speeds
@@ -508,7 +517,7 @@ def _after_arc(state: _State, twist: Twist, steady: Steady, dt: float) -> _State
         raise ValueError(f'wheel_angles must be finite, got {[right, left]}')
     if moments is not None:
         moments = propagated_moments(moments, pose[2], twist, steady.densities, dt)
-    return arc_end(pose, twist, dt), (right, left), moments, truth
+    return State(arc_end(pose, twist, dt), (right, left), moments, truth)
 
 
 def _truth(model: RobotModel, pose: Pose) -> Truth | None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
-from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
+from diffdrive_jacobian.kinematics.saturation import ROUNDING, VelocityLimits, scaled_to_limits
 from diffdrive_jacobian.numerics.checks import Checked, NotNegative, Positive, instance, pair
 from diffdrive_jacobian.simulation.actuators import IDEAL, Actuators, Duration, Speeds
 from diffdrive_jacobian.simulation.odometry_noise import spectral_densities
@@ -81,8 +81,9 @@ class RobotModel(Checked):
         if self.limits.max_wheel_speed < math.inf:
             # The smaller wheel may still be too fast.
             fastest = max(map(abs, self.wheel_speeds(v, omega)))
-            excess = max(1.0, fastest / self.limits.max_wheel_speed)
-            v, omega = v / excess, omega / excess
+            excess = fastest / self.limits.max_wheel_speed
+            if excess > 1.0:
+                v, omega = v / excess * (1.0 - ROUNDING), omega / excess * (1.0 - ROUNDING)
         return v, omega
 
     @property

@@ -17,7 +17,6 @@ Sources: doc/mathematics.md, "Slip"; Salmon, Moraes, Dror and Shaw, "Parallel ra
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Annotated, NamedTuple
@@ -25,7 +24,15 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from diffdrive_jacobian.numerics.checks import Checked, Positive, integer, optional
-from diffdrive_jacobian.simulation.speeds import STANDSTILL, Piece, Pose, Profile, moved, rolled
+from diffdrive_jacobian.simulation.speeds import (
+    STANDSTILL,
+    Course,
+    Piece,
+    Pose,
+    Profile,
+    combined,
+    moved,
+)
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 CELL = 20_000_000
@@ -57,17 +64,34 @@ class Drift(Checked):
     """True wheel separation, relative to the one that the odometry assumes [-]."""
 
 
+class Wheel(NamedTuple):
+    """What a wheel has slipped in the present cell."""
+
+    a: float = 0.0
+    """Distance slipped, for xi = 1 (m)."""
+    V: float = 0.0
+    """Variance of the distance rolled (m^2)."""
+
+    def slip(self, rolling: Course, seconds: float, k: float) -> float:
+        """Return the speed of the slip for xi = 1, which has the variance of the distance after a time
+        (s).
+        """
+        return (math.sqrt(self.V + k * rolling.rolled(seconds)) - self.a) / seconds
+
+    def after(self, rolling: Course, slip: float, seconds: float, k: float) -> Wheel:
+        """Return the wheel after a time (s) in which it slipped at a speed for xi = 1."""
+        return Wheel(self.a + slip * seconds, self.V + k * rolling.rolled(seconds))
+
+
 class Cell(NamedTuple):
-    """A cell, and what its wheels have slipped in it so far: right, left."""
+    """A cell of time, with the wheels in it."""
 
     level: int
     """The cell has the width `CELL << level`."""
     number: int
     """It begins at this multiple of its width."""
-    a: tuple[float, float] = (0.0, 0.0)
-    """What was slipped, for xi = 1 (m)."""
-    V: tuple[float, float] = (0.0, 0.0)
-    """Variance of the distance rolled (m^2)."""
+    wheels: tuple[Wheel, Wheel] = (Wheel(), Wheel())
+    """Right, left."""
 
     @property
     def end(self) -> int:
@@ -109,7 +133,7 @@ class Truth:
         time, pose, cell = begin, self.pose, self._cell
         if self._drift.seed is None or not k:
             for piece, _ in motion.steps(motion.seconds(begin), motion.seconds(end)):
-                pose = moved(pose, self._rims(piece, L).mapped(self._to_twist(L)))
+                pose = moved(pose, self._body(piece.seconds, self._rims(piece, L), L))
             return Truth(self._drift, pose)
         if self._ahead is not None and self._ahead[0] is motion and self._ahead[1] <= end:
             _, time, pose = self._ahead
@@ -128,56 +152,52 @@ class Truth:
     def twist(self, motion: Profile, stamp: int, L: float, k: float) -> tuple[float, float]:
         """Return the true twist, the slip included, from a time (ns) on."""
         cell = _present(self._cell, motion, stamp)
-        rims, *_ = next(self._slipping(cell, motion, stamp, L, k))
-        v, omega = rims.mapped(self._to_twist(L)).twist(0.0)
+        piece = motion.between(motion.seconds(stamp), motion.seconds(cell.end))[0]
+        rims = self._rims(piece, L)
+        v, omega = self._body(0.0, self._slipping(cell, rims, piece.seconds, k)[0], L).twist(0.0)
         return v, omega
 
     def _in_cell(
         self, cell: Cell, pose: Pose, motion: Profile, begin: int, end: int, L: float, k: float
     ) -> tuple[Pose, Cell]:
         """Return the pose and the cell after a part of it, from `begin` to `end` (ns)."""
-        time, last = motion.seconds(begin), motion.seconds(end)
-        here = cell
-        for rims, rolling, here, (gain_R, gain_L) in self._slipping(cell, motion, begin, L, k):
-            seconds = min(rims.seconds, last - time)
-            pose = moved(pose, rims.part(0.0, seconds).mapped(self._to_twist(L)))
-            time += seconds
-            if time >= last:
-                a = here.a[0] + gain_R * seconds, here.a[1] + gain_L * seconds
-                return pose, here._replace(a=a, V=_grown(here.V, rolling, seconds, k))
-        return pose, here
+        left = motion.seconds(end) - motion.seconds(begin)
+        for piece in motion.between(motion.seconds(begin), motion.seconds(cell.end)):
+            rims = self._rims(piece, L)
+            # The speed of the slip is that for the whole piece.
+            slipping, slips = self._slipping(cell, rims, piece.seconds, k)
+            seconds = min(piece.seconds, left)
+            pose = moved(pose, self._body(seconds, slipping, L))
+            right_wheel, left_wheel = (
+                wheel.after(rim, slip, seconds, k)
+                for wheel, rim, slip in zip(cell.wheels, rims, slips, strict=True)
+            )
+            cell, left = cell._replace(wheels=(right_wheel, left_wheel)), left - seconds
+            if left <= 0.0:
+                break
+        return pose, cell
 
     def _slipping(
-        self, cell: Cell, motion: Profile, begin: int, L: float, k: float
-    ) -> Iterator[tuple[Piece, Piece, Cell, tuple[float, float]]]:
-        """Yield the pieces from a time (ns) to the end of a cell.
+        self, cell: Cell, rims: tuple[Course, Course], seconds: float, k: float
+    ) -> tuple[tuple[Course, Course], list[float]]:
+        """Return the speeds of the rims with the slip, and those of the slip for xi = 1."""
+        seed = self._drift.seed
+        if seed is None or not k:
+            return rims, [0.0, 0.0]
+        slips = [wheel.slip(rim, seconds, k) for wheel, rim in zip(cell.wheels, rims, strict=True)]
+        xi_R, xi_L = normals(seed, cell.level, cell.number)
+        return (rims[0].plus(xi_R * slips[0]), rims[1].plus(xi_L * slips[1])), slips
 
-        Each is the speeds of the true rims of right and left wheel, with and without the slip; the cell
-        at its beginning; and the speeds of the slip for xi = 1.
-        """
-        seed, gains = self._drift.seed, (0.0, 0.0)
-        slips = seed is not None and k > 0.0
-        xi_R, xi_L = normals(seed, cell.level, cell.number) if seed is not None else gains
-        for piece in motion.between(motion.seconds(begin), motion.seconds(cell.end)):
-            rims = rolling = self._rims(piece, L)
-            if slips:
-                V_R, V_L = V = _grown(cell.V, rolling, piece.seconds, k)
-                a_R, a_L = a = math.sqrt(V_R), math.sqrt(V_L)
-                gains = (a_R - cell.a[0]) / piece.seconds, (a_L - cell.a[1]) / piece.seconds
-                rims = rolling.faster(gains[0] * xi_R, gains[1] * xi_L)
-            yield rims, rolling, cell, gains
-            if slips:
-                cell = cell._replace(a=a, V=V)
-
-    def _rims(self, piece: Piece, L: float) -> Piece:
+    def _rims(self, piece: Piece, L: float) -> tuple[Course, Course]:
         """Return the speeds of the true rims of right and left wheel without slip."""
-        m_R, m_L = self._drift.right_wheel_radius_multiplier, self._drift.left_wheel_radius_multiplier
-        return piece.mapped(((m_R, m_R * L / 2.0), (m_L, -m_L * L / 2.0)))
+        drift = self._drift
+        return piece.rims(L, drift.right_wheel_radius_multiplier, drift.left_wheel_radius_multiplier)
 
-    def _to_twist(self, L: float) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return the matrix from the speeds of the true rims to the true twist."""
-        separation = L * self._drift.wheel_separation_multiplier
-        return (0.5, 0.5), (1.0 / separation, -1.0 / separation)
+    def _body(self, seconds: float, rims: tuple[Course, Course], L: float) -> Piece:
+        """Return the true motion of the body, from the speeds of the true rims."""
+        (right, left), separation = rims, L * self._drift.wheel_separation_multiplier
+        v = combined(0.5, right, 0.5, left)
+        return Piece(seconds, v, combined(1.0 / separation, right, -1.0 / separation, left))
 
 
 def _present(cell: Cell | None, motion: Profile, time: int) -> Cell:
@@ -190,14 +210,6 @@ def _present(cell: Cell | None, motion: Profile, time: int) -> Cell:
         return cell
     level = (max(held, 0) // HOLD).bit_length()
     return Cell(level, time // (CELL << level))
-
-
-def _grown(V: tuple[float, float], rolling: Piece, seconds: float, k: float) -> tuple[float, float]:
-    """Return the variances of the distances rolled after a time (s) of a piece (m^2)."""
-    return (
-        V[0] + k * rolled(rolling.v, rolling, seconds),
-        V[1] + k * rolled(rolling.omega, rolling, seconds),
-    )
 
 
 def normals(seed: int, level: int, cell: int) -> tuple[float, float]:

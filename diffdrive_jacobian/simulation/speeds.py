@@ -21,8 +21,6 @@ from diffdrive_jacobian.numerics.elementary import ceil, exp, expm1, maximum, wr
 from diffdrive_jacobian.numerics.formula import Number
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-Course: TypeAlias = tuple[Number, Number, Number]
-"""a, b and c of a speed."""
 Pose: TypeAlias = tuple[float, float, float]
 """`(x, y, theta)` (m, m, rad)."""
 Twist: TypeAlias = tuple[float, float]
@@ -60,116 +58,138 @@ QUADRATURES = (0.05, Quadrature.of(3)), (0.25, Quadrature.of(4)), (math.inf, Qua
 """The size of a step, and the quadrature for steps of at most that size."""
 
 
-def speed_at(course: Course, t: Number, tau: float) -> Number:
-    """Return a speed after the time t."""
-    a, b, c = course
-    # At the beginning it is the given speed, without rounding, also where that is zero.
-    return (a + c) + (b * t + c * expm1(-t / tau)) if tau else a + b * t
+class Course(NamedTuple):
+    """A speed over time, `a + b t + c exp(-t / tau)`.
+
+    That of one robot, of floats, or those of many, with arrays in their place.
+    """
+
+    a: Number
+    b: Number = 0.0
+    c: Number = 0.0
+    tau: float = 0.0
+    """Time constant (s); 0: there is none, and c is 0."""
+
+    def at(self, t: Number) -> Number:
+        """Return the speed after the time t."""
+        a, b, c, tau = self
+        # At the beginning it is the given speed, without rounding, also where that is zero.
+        return (a + c) + (b * t + c * expm1(-t / tau)) if tau else a + b * t
+
+    def travelled(self, t: Number) -> Number:
+        """Return its integral over the time t."""
+        a, b, c, tau = self
+        line = (a + b * t / 2.0) * t
+        return line - c * tau * expm1(-t / tau) if tau else line
+
+    def later(self, t: Number) -> Course:
+        """Return the course that begins at the time t."""
+        a, b, c, tau = self
+        return Course(a + b * t, b, c * exp(-t / tau), tau) if tau else Course(a + b * t, b)
+
+    def plus(self, speed: Number) -> Course:
+        """Return the course with a constant speed added."""
+        return self._replace(a=self.a + speed)
+
+    def sign_changes(self, seconds: float) -> list[float]:
+        """Return the times within a duration at which the speed of one robot changes its sign, in
+        order.
+        """
+        _, b, c, tau = self
+        bounds = [0.0, seconds]
+        if c and b and c / (b * tau) > 0.0:
+            # At the extremum.
+            extremum = tau * math.log(c / (b * tau))
+            if 0.0 < extremum < seconds:
+                bounds.insert(1, extremum)
+        found = []
+        for low, high in pairwise(bounds):
+            first = self.at(low)
+            if first * self.at(high) >= 0.0:
+                continue
+            if not c:
+                found.append(low - first / b)
+                continue
+            while low < (middle := (low + high) / 2.0) < high:
+                if (self.at(middle) > 0.0) == (first > 0.0):
+                    low = middle
+                else:
+                    high = middle
+            found.append(low)
+        return found
+
+    def rolled(self, seconds: float) -> float:
+        """Return the integral of the absolute value of the speed of one robot over a time (s)."""
+        times = [0.0, *self.sign_changes(seconds), seconds]
+        return float(sum(abs(b - a) for a, b in pairwise(map(self.travelled, times))))
 
 
-def travelled(course: Course, t: Number, tau: float) -> Number:
-    """Return the integral of a speed over the time t."""
-    a, b, c = course
-    line = (a + b * t / 2.0) * t
-    return line - c * tau * expm1(-t / tau) if tau else line
+def combined(p: float, first: Course, q: float, second: Course) -> Course:
+    """Return `p first + q second`, of courses with one time constant."""
+    a, b, c = (p * one + q * other for one, other in zip(first[:3], second[:3], strict=True))
+    return Course(a, b, c, first.tau)
 
 
 class Piece(NamedTuple):
-    """A twist over a time in which each of its speeds follows one course.
-
-    Of one robot, with floats, or of many, with arrays in their place.
-    """
+    """A twist over a time in which each of its speeds follows one course, with one time constant."""
 
     seconds: Number
     """Duration (s); the last piece: infinite."""
     v: Course
     omega: Course
-    tau: float = 0.0
-    """Time constant of the exponential function (s); 0: there is none, and c is 0."""
 
     @property
     def constant(self) -> bool:
-        """Whether both speeds are constant."""
-        return not (any(self.v[1:]) or any(self.omega[1:]))
+        """Whether both speeds of one robot are constant."""
+        return not (self.v.b or self.v.c or self.omega.b or self.omega.c)
 
     def twist(self, t: Number) -> tuple[Number, Number]:
         """Return the twist after the time t."""
-        return speed_at(self.v, t, self.tau), speed_at(self.omega, t, self.tau)
+        return self.v.at(t), self.omega.at(t)
 
     def part(self, begin: Number, end: Number) -> Piece:
         """Return the piece from one time to another."""
-        decay = exp(-begin / self.tau) if self.tau else 1.0
-        v, omega = ((a + b * begin, b, c * decay) for a, b, c in (self.v, self.omega))
-        return Piece(end - begin, v, omega, self.tau)
+        return Piece(end - begin, self.v.later(begin), self.omega.later(begin))
 
-    def mapped(self, rows: tuple[Twist, Twist]) -> Piece:
-        """Return the piece with its twist multiplied by a matrix."""
-        v, omega = (
-            (
-                p * self.v[0] + q * self.omega[0],
-                p * self.v[1] + q * self.omega[1],
-                p * self.v[2] + q * self.omega[2],
-            )
-            for p, q in rows
-        )
-        return Piece(self.seconds, v, omega, self.tau)
-
-    def faster(self, v: float, omega: float) -> Piece:
-        """Return the piece with constant speeds added."""
-        (a, b, c), (d, e, f) = self.v, self.omega
-        return self._replace(v=(a + v, b, c), omega=(d + omega, e, f))
-
-    @property
-    def step(self) -> float:
-        """Duration of the steps of the quadrature (s)."""
-        return float(self.seconds if self.constant else self.seconds / self.steps)
+    def rims(self, L: float, m_R: float = 1.0, m_L: float = 1.0) -> tuple[Course, Course]:
+        """Return the speeds of the rims of right and left wheel: `m_R (v + omega L/2)`, `m_L (v -
+        ...)`.
+        """
+        right = combined(m_R, self.v, m_R * L / 2.0, self.omega)
+        return right, combined(m_L, self.v, -m_L * L / 2.0, self.omega)
 
     @property
     def steps(self) -> Number:
-        """Number of steps of the quadrature."""
-        a, b, c = self.omega
-        steps = (abs(a) + abs(b) * self.seconds / 2.0) * self.seconds / MAX_TURN
-        if self.tau:
-            # The speed lies between that at the beginning and those that it follows. (In a short piece
-            # with a large b the terms of the speed are much larger than their sum.)
-            first = a + b * self.tau
-            fastest = maximum(abs(a + c), abs(first), abs(first + b * self.seconds))
-            steps = fastest * self.seconds / MAX_TURN
-            steps = maximum(steps, self.seconds / self.tau / MAX_DECAY)
-        return maximum(1.0, ceil(steps))
-
-    def state(self, t: Number) -> tuple[Number, Number, Number, Number]:
-        """Return the twist after the time t, and the path and the turn until then."""
-        (a, b, c), (d, e, f), tau = self.v, self.omega, self.tau
-        path, turn = (a + b * t / 2.0) * t, (d + e * t / 2.0) * t
+        """Number of steps of the quadrature, of equal duration; 1: the piece is constant."""
+        (a, b, c, tau), T = self.omega, self.seconds
         if tau:
-            loss = expm1(-t / tau)
-            v, omega = (a + c) + (b * t + c * loss), (d + f) + (e * t + f * loss)
-            path, turn = path - c * tau * loss, turn - f * tau * loss
-            return v, omega, path, turn
-        return a + b * t, d + e * t, path, turn
+            # omega lies between that at the beginning and those that it follows. (In a short piece with
+            # a large b the terms of omega are much larger than their sum.)
+            first = a + b * tau
+            fastest = maximum(abs(a + c), abs(first), abs(first + b * T))
+            return ceil(maximum(1.0, fastest * T / MAX_TURN, T / tau / MAX_DECAY))
+        return ceil(maximum(1.0, (abs(a) + abs(b) * T / 2.0) * T / MAX_TURN))
 
     def quadrature(self, t: float) -> Quadrature:
-        """Return the quadrature for the time t, at most a step: with more nodes if it turns or decays
-        more.
+        """Return the quadrature for the time t, at most a step: with more nodes for a larger turn or
+        decay.
 
         The error of the displacement is below 1e-14 of the path, with a lag below 1e-12.
         """
-        d, e, f = self.omega
-        # With the derivative of order n of exp(i e t^2 / 2), up to n!! sqrt(e)^n.
-        size = (abs(d) + abs(f) + 1.8 * sqrt(abs(e))) * t
-        if self.tau:
-            size = max(size, t / self.tau)
+        a, b, c, tau = self.omega
+        # With the derivative of order n of exp(i b t^2 / 2), up to n!! sqrt(b)^n.
+        size = (abs(a) + abs(c) + 1.8 * sqrt(abs(b))) * t
+        size = max(size, t / tau) if tau else size
         return next(quadrature for most, quadrature in QUADRATURES if size <= most)
 
     def displacement(self, t: float) -> Pose:
         """Compute `(dx, dy, dtheta)` in the body frame of the beginning, after at most a step."""
         x = y = 0.0
         for node, weight in self.quadrature(t).nodes:
-            v, _, _, turn = self.state(node * t)
+            v, turn = self.v.at(node * t), self.omega.travelled(node * t)
             x += weight * v * cos(turn)
             y += weight * v * sin(turn)
-        return x * t, y * t, travelled(self.omega, t, self.tau)
+        return x * t, y * t, self.omega.travelled(t)
 
 
 class Profile:
@@ -224,22 +244,24 @@ class Profile:
 
         Each is a piece that begins with the step and lasts as long, and the time at its end (s).
         """
-        index = bisect_right(self.begins, begin) - 1
+        index, last = bisect_right(self.begins, begin) - 1, len(self.begins) - 1
         while begin < end:
             start, piece = self.begins[index], self.pieces[index]
-            limit = self.begins[index + 1] if index + 1 < len(self.begins) else math.inf
-            step = piece.step
-            if step < math.inf:
+            piece_end = limit = self.begins[index + 1] if index < last else math.inf
+            if not piece.constant:
+                step = piece.seconds / piece.steps
                 number = int((begin - start) / step) + 1
-                # The quotient rounds.
-                number += start + number * step <= begin
-                if start + (number + 0.5) * step < limit:
+                if start + number * step <= begin:
+                    # The quotient rounds.
+                    number += 1
+                if start + (number + 0.5) * step < piece_end:
                     # Long after the start a step may be shorter than the resolution of its time.
                     limit = max(start + number * step, math.nextafter(begin, math.inf))
             limit = min(limit, end)
             if limit > begin:
                 yield piece.part(begin - start, limit - start), limit
-            index += index + 1 < len(self.begins) and limit == self.begins[index + 1]
+            if limit == piece_end:
+                index += 1
             begin = limit
 
 
@@ -247,11 +269,10 @@ def moved(pose: Pose, piece: Piece) -> Pose:
     """Return the pose after a piece, in steps that are short enough for one quadrature."""
     if piece.constant:
         return arc_end(pose, piece.twist(0.0), piece.seconds)
-    begin, step = 0.0, piece.step
-    for number in range(1, round(piece.seconds / step) + 1):
-        part = piece.part(begin, number * step)
-        pose = displaced(pose, part.displacement(part.seconds))
-        begin = number * step
+    count = int(piece.steps)
+    for number in range(count):
+        step = piece.part(piece.seconds * number / count, piece.seconds * (number + 1) / count)
+        pose = displaced(pose, step.displacement(step.seconds))
     return pose
 
 
@@ -263,42 +284,6 @@ def displaced(pose: Pose, displacement: Pose) -> Pose:
     if not (isfinite(x) and isfinite(y) and isfinite(turn)):
         raise ValueError('pose, twist and dt must give a finite result, but it overflows')
     return x, y, wrap(theta + turn)
-
-
-def sign_changes(course: Course, seconds: float, tau: float) -> list[float]:
-    """Return the times within a duration at which a speed changes its sign, in their order."""
-    _, b, c = course
-    bounds = [0.0, seconds]
-    if c and b and c / (b * tau) > 0.0:
-        # At the extremum.
-        extremum = tau * math.log(c / (b * tau))
-        if 0.0 < extremum < seconds:
-            bounds.insert(1, extremum)
-    found = []
-    for low, high in pairwise(bounds):
-        first, last = speed_at(course, low, tau), speed_at(course, high, tau)
-        if first * last >= 0.0:
-            continue
-        if not c:
-            found.append(low - first / b)
-            continue
-        while True:
-            middle = (low + high) / 2.0
-            if not low < middle < high:
-                break
-            if (speed_at(course, middle, tau) > 0.0) == (first > 0.0):
-                low = middle
-            else:
-                high = middle
-        found.append(low)
-    return found
-
-
-def rolled(course: Course, piece: Piece, seconds: float) -> float:
-    """Return the integral of the absolute value of a speed of a piece over a time (s)."""
-    times = [0.0, *sign_changes(course, seconds, piece.tau), seconds]
-    places = [travelled(course, time, piece.tau) for time in times]
-    return float(sum(abs(end - begin) for begin, end in pairwise(places)))
 
 
 def arc_end(pose: Pose, twist: Twist, dt: float) -> Pose:

@@ -235,6 +235,13 @@ def test_a_controller_without_gains_has_its_defaults():
     )
 
 
+def test_other_gains_and_settings_than_there_are_are_named():
+    with pytest.raises(ValueError, match='law rejects the starts, goals and gains: go_to_goal: missing'):
+        closed_loops('go_to_goal', [0.0, 0.0, 0.0], [1.0, 0.0], 3.0)
+    with pytest.raises(TypeError, match=r"trajectories\(\) got an unexpected keyword argument 'rat'"):
+        trajectories('go_to_goal', [0.0, 0.0, 0.0], [1.0, 0.0], rat=3.0)
+
+
 def test_an_empty_batch_is_an_empty_result():
     for shape in ((0,), (3, 0)):
         said = []

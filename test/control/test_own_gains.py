@@ -276,3 +276,11 @@ def test_an_invalid_state_is_named():
         own = replace(INTEGRAL, law=lambda *_, result=result, **__: result)
         with pytest.raises(LawError, match=re.escape(words)):
             own.bind(SimpleNamespace(kp=1.0, kv=1.0, ki=1.0))(np.zeros(3), np.ones(3))
+
+
+def test_a_gain_with_a_lower_bound_of_its_own_has_a_usual_range():
+    assert Gain(name='a', default=0.0, above=-1.0).usual == (0.0, 100.0)
+    assert Gain(name='a', default=1.0, bounds=(0.0, 100.0), above=0.5).usual == (1.0, 3.0)
+    for usual in ('x', None, 3.0, (2.0, 1.0)):
+        with pytest.raises(ValueError, match='usual must '):
+            Gain(name='a', default=1.0, usual=usual)

@@ -7,6 +7,7 @@ import pytest
 
 from diffdrive_jacobian.control import VelocityLimits, saturate
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+from diffdrive_jacobian.simulation import RobotModel
 
 R, L = 0.033, 0.16
 BODY_LIMITS = ['min_v', 'max_v', 'min_omega', 'max_omega']
@@ -135,3 +136,19 @@ def test_what_does_not_fit_together_is_named():
     for missing in ((), (R,), (None, L)):
         with pytest.raises(ValueError, match='max_wheel_speed, so r and L must be given'):
             saturate(1.0, 2.0, limits, *missing)
+
+
+def test_wheels_of_different_radii_do_not_exceed_their_limit_by_the_last_bit():
+    model = RobotModel(
+        right_wheel_radius_multiplier=1.03,
+        left_wheel_radius_multiplier=0.97,
+        limits=VelocityLimits(max_wheel_speed=10.0),
+    )
+    for command in np.random.default_rng(3).uniform(-5.0, 5.0, (2000, 2)).tolist():
+        assert max(map(abs, model.wheel_speeds(*model.limited(command)))) <= 10.0
+
+
+def test_a_robot_and_a_batch_overflow_alike():
+    for v in (1.0, [1.0]):
+        with pytest.raises(ValueError, match='overflow'):
+            saturate(v, 1e308, VelocityLimits(max_v=1.0, max_wheel_speed=1e300), 0.033, 100.0)

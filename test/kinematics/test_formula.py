@@ -176,3 +176,8 @@ def test_sizes_by_a_name_are_for_methods():
         @formula('(joints) -> ()')
         def arm(q):
             return sum(q)
+
+
+def test_checks_are_of_arguments():
+    with pytest.raises(TypeError, match='checks must be of r, L, got l'):
+        formula('(),() -> ()', l=positive)(lambda r, L: r * L)

@@ -13,7 +13,7 @@ from diffdrive_jacobian.faults.robot import ActuatorLag
 from diffdrive_jacobian.simulation import Robot, RobotModel, quadrature_moments
 from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 from diffdrive_jacobian.simulation.slip import Drift
-from diffdrive_jacobian.simulation.speeds import Piece, Profile
+from diffdrive_jacobian.simulation.speeds import Course, Piece, Profile
 
 SECOND = 1_000_000_000
 L = 0.16
@@ -294,9 +294,9 @@ def test_a_lag_below_the_resolution_of_times_is_refused():
 
 def test_steps_progress_also_where_they_are_shorter_than_the_resolution_of_times():
     """After a ramp of 30 years that is 1e-7 s."""
-    ramp = Piece(1e9, (0.0, 1e-9, 0.0), (0.0, 0.0, 0.0))
-    lagging = Piece(36e-8, (1.0, 0.0, -1.0), (0.0, 0.0, 0.0), 1e-8)
-    profile = Profile(0, [ramp, lagging, Piece(math.inf, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))])
+    ramp = Piece(1e9, Course(0.0, 1e-9), Course(0.0))
+    lagging = Piece(36e-8, Course(1.0, 0.0, -1.0, 1e-8), Course(0.0, tau=1e-8))
+    profile = Profile(0, [ramp, lagging, Piece(math.inf, Course(1.0), Course(0.0))])
     ends = [end for _, end in islice(profile.steps(1e9 - 1.0, 1e9 + 1.0), 1000)]
     assert ends[-1] == 1e9 + 1.0
     assert all(first < second for first, second in pairwise(ends))

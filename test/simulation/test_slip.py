@@ -224,6 +224,17 @@ def test_the_robot_stays_where_it_is_when_time_goes_back_or_its_drift_changes():
     assert perfect.remodelled(other, SECOND).true_pose_tuple == perfect.pose_tuple
 
 
+def test_a_nanosecond_does_not_change_what_was_slipped():
+    """Whatever the seconds between two commands round to, which are in one cell or two."""
+    begin = 5 * CELL - 2_414_970
+    for offset in (12_516_919, *np.random.default_rng(9).integers(1, 3 * CELL, 40).tolist()):
+        first, second = (
+            driven(robot(seed=3), [((0.5, 0.0), begin), ((0.5, 0.1), begin + at)], 9 * CELL).true_pose
+            for at in (offset, offset + 1)
+        )
+        np.testing.assert_allclose(first, second, rtol=0.0, atol=1e-8)
+
+
 def test_a_robot_that_is_restarted_does_not_slip_on():
     """Also not one that was under way to another speed."""
     model = RobotModel(drift=Drift(seed=1), actuators=Actuators(lag=0.1))
