@@ -82,13 +82,30 @@ class Arrival(Comparable):
         distance = distance_to_goal.floats(x, y, theta, x_goal, y_goal, self.offset)
         return bool(distance <= self.xy_tolerance)
 
-    def faces(self, theta: Any, heading: Any) -> Any:
-        """Return whether a robot has the heading of a goal: numbers or arrays (rad), without checks."""
-        return abs(wrap(heading - theta)) <= self.yaw_tolerance
-
     def stopped(self, v: Any, omega: Any) -> Any:
         """Return whether a robot with a twist is slow enough, numbers or arrays; NaN is not."""
         return (abs(v) <= self.trans_stopped_velocity) & (abs(omega) <= self.rot_stopped_velocity)
+
+    def progress(self, near: Any, turning: Any, twist: Any, theta: Any, heading: Any) -> tuple[Any, ...]:
+        """Return what a robot does at its last goal: Booleans, or arrays of them, without checks.
+
+        Args:
+            near: Whether it is within the tolerance of the position.
+            turning: Whether it was, and only the heading remains.
+            twist: Its twist `(v, omega)` (m/s, rad/s).
+            theta: Its heading (rad).
+            heading: That of the goal (rad).
+
+        Returns:
+            Whether only the heading remains, whether it turns to it, and whether it has arrived. One
+            that is near and does neither stops.
+        """
+        stopped = self.stopped(*twist)
+        if not self.use_heading:
+            return turning, turning & False, (near | turning) & stopped
+        turning = turning | (near & stopped)
+        faces = abs(wrap(heading - theta)) <= self.yaw_tolerance
+        return turning, turning & (faces ^ True), turning & faces & stopped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,26 +160,22 @@ class Waypoints:
 
         What the law raises is passed on. The pose is not checked again.
         """
-        if self.turning and not arrival.use_heading:
-            # The position was reached, and the heading no longer counts.
-            return self, None
         x, y, theta = pose
         index, goal = self.index, self._goal
-        there = self.turning or arrival.reached(x, y, theta, goal[0], goal[1])
-        while there and not self.turning and index + 1 < len(self.poses):
+        near = self.turning or arrival.reached(x, y, theta, goal[0], goal[1])
+        while near and not self.turning and index + 1 < len(self.poses):
             index += 1
             goal = tuple(self.poses[index].tolist())
-            there = arrival.reached(x, y, theta, goal[0], goal[1])
-        stopped = there and arrival.stopped(*twist)
-        turning = self.turning or (stopped and arrival.use_heading)
+            near = arrival.reached(x, y, theta, goal[0], goal[1])
+        if not near:
+            return self._progressed(index, False) if index > self.index else self, law(pose, goal)
+        turning, turns, arrived = arrival.progress(near, self.turning, twist, theta, goal[2])
         here = self
         if (index, turning) != (self.index, self.turning):
             here = self._progressed(index, turning)
-        if not there:
-            return here, law(pose, goal)
-        if turning and not arrival.faces(theta, goal[2]):
+        if turns:
             return here, turn_in_place.formula(theta, goal[2], turning_gain)
-        return here, None if stopped else STANDSTILL
+        return here, None if arrived else STANDSTILL
 
     def remaining(self, pose: Pose, arrival: Arrival, turn: float = 0.0) -> tuple[float, float]:
         """Return how far a robot may still roll and turn, so that it can stop at the last goal (m, rad).

@@ -15,12 +15,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import accumulate, product
 from math import inf, pi
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics.singular_values import EPS, refuse_singular
-from diffdrive_jacobian.numerics.checks import array, finite, positive, read_only
+from diffdrive_jacobian.numerics.checks import Comparable, array, finite, positive, read_only
 from diffdrive_jacobian.numerics.elementary import (
     atan2,
     cos,
@@ -88,8 +89,16 @@ def _force_or_wrench(name: str, value: NDArray[np.float64]) -> None:
         raise ValueError(f'{name} must have shape (..., 2) or (..., 3), got {value.shape}')
 
 
+def _lengths(name: str, value: Any) -> NDArray[np.float64]:
+    """Require the lengths of one arm, shape (n,), n >= 1. Returns them read-only."""
+    checked = positive(name, array(name, value, 'n'))
+    if checked.ndim != 1:
+        raise ValueError(f'{name} must have shape (n,), got {checked.shape}')
+    return read_only(checked)
+
+
 @dataclass(frozen=True, eq=False)
-class PlanarArm:
+class PlanarArm(Comparable):
     """Links in a chain, each joint turning about the z axis.
 
     Joint angles q have the shape (..., n) (rad), positions and obstacles are in the frame of the arm
@@ -97,15 +106,8 @@ class PlanarArm:
     number, raise ValueError.
     """
 
-    lengths: NDArray[np.float64]
+    lengths: Annotated[Any, _lengths]
     """Distances from joint to joint, the last to the tip, shape (n,) (m). Read-only."""
-
-    def __init__(self, lengths: ArrayLike) -> None:
-        """Take the lengths of the links, shape (n,), n >= 1 (m)."""
-        checked = positive('lengths', array('lengths', lengths, 'n'))
-        if checked.ndim != 1:
-            raise ValueError(f'lengths must have shape (n,), got {checked.shape}')
-        object.__setattr__(self, 'lengths', read_only(checked))
 
     @property
     def joints(self) -> int:

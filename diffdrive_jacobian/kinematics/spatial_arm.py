@@ -19,7 +19,7 @@ lower-pair mechanisms based on matrices", 1955; P. Corke, *Robotics, Vision and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import pi
 from typing import Any
 
@@ -35,7 +35,15 @@ from diffdrive_jacobian.kinematics.spatial import (
     rigid,
     spatial_displacement_jacobian,
 )
-from diffdrive_jacobian.numerics.checks import array, finite, floats, integer, one_of, read_only
+from diffdrive_jacobian.numerics.checks import (
+    Comparable,
+    array,
+    finite,
+    floats,
+    integer,
+    one_of,
+    read_only,
+)
 from diffdrive_jacobian.numerics.elementary import cos, dot, product, sin
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
@@ -61,51 +69,48 @@ def link(a: Number, alpha: Number, d: Number, theta: Number) -> tuple[Rows, Entr
 
 
 @dataclass(frozen=True, eq=False)
-class SpatialArm:
+class SpatialArm(Comparable):
     """Joints in a chain in space. All arrays are read-only.
 
     Joints q have the shape (..., n) (rad, or m where a joint slides). Parameters of different lengths or
     that are not finite, joints that do not exist, and limits that are no pair raise ValueError.
     """
 
-    a: NDArray[np.float64]
-    """Distances along the x axis of each link, shape (n,) (m)."""
-    alpha: NDArray[np.float64]
+    a: Any
+    """Distances along the x axis of each link, shape (n,), or one for all joints (m)."""
+    alpha: Any
     """Angles about that axis, from one joint's axis to the next, shape (n,) (rad)."""
-    d: NDArray[np.float64]
+    d: Any
     """Distances along the axis of each joint, shape (n,) (m)."""
-    theta: NDArray[np.float64]
+    theta: Any = 0.0
     """Angles about the axis of each joint where q is 0, shape (n,) (rad)."""
-    slides: NDArray[np.float64]
-    """1 for each joint that slides, 0 for one that turns, shape (n,)."""
-    limits: tuple[NDArray[np.float64], NDArray[np.float64]] | None
+    prismatic: tuple[int, ...] = ()
+    """Indices of the joints that slide."""
+    limits: Any = None
     """Lower and upper limits of the joints, shape (n,) each. None: they are not known."""
+    slides: NDArray[np.float64] = field(init=False, repr=False)
+    """1 for each joint that slides, 0 for one that turns, shape (n,)."""
 
-    def __init__(
-        self,
-        a: ArrayLike,
-        alpha: ArrayLike,
-        d: ArrayLike,
-        theta: ArrayLike = 0.0,
-        prismatic: tuple[int, ...] = (),
-        limits: tuple[ArrayLike, ArrayLike] | None = None,
-    ) -> None:
-        """Take the parameters, each of shape (n,) or one for all joints."""
-        given = {'a': a, 'alpha': alpha, 'd': d, 'theta': theta}
-        values = {name: floats(name, value) for name, value in given.items()}
+    def __post_init__(self) -> None:
+        """Check every value."""
+        names = 'a', 'alpha', 'd', 'theta'
+        values = {name: finite(name, floats(name, getattr(self, name))) for name in names}
         shapes = {value.shape for value in values.values() if value.ndim}
         if len(shapes) != 1 or any(len(shape) > 1 or shape == (0,) for shape in shapes):
             found = ', '.join(f'{name} {value.shape}' for name, value in values.items())
             raise ValueError(f'a, alpha, d and theta must have one shape (n,), with n >= 1, got {found}')
         ((n,),) = shapes
         slides = np.zeros(n)
-        for joint in np.atleast_1d(prismatic).tolist():
-            slides[integer('prismatic', joint, 0, n - 1)] = 1.0
+        joints = [
+            integer('prismatic', joint, 0, n - 1) for joint in np.atleast_1d(self.prismatic).tolist()
+        ]
+        slides[joints] = 1.0
         for name, value in {**values, 'slides': slides}.items():
-            finite(name, value)
             object.__setattr__(self, name, read_only(np.broadcast_to(value, n)))
-        pair = None if limits is None else joint_limits(limits, n)
-        object.__setattr__(self, 'limits', pair and tuple(map(read_only, pair)))
+        object.__setattr__(self, 'prismatic', tuple(joints))
+        if self.limits is not None:
+            pair = joint_limits(self.limits, n)
+            object.__setattr__(self, 'limits', tuple(map(read_only, pair)))
 
     @property
     def joints(self) -> int:

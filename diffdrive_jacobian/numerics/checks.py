@@ -457,11 +457,14 @@ class Comparable(Checked):
         return hash(self._values())
 
     def _values(self) -> tuple[Any, ...]:
-        values = (getattr(self, field.name) for field in dataclasses.fields(self))  # type: ignore[arg-type]
-        return tuple(
-            (value.shape, *value.ravel().tolist()) if hasattr(value, 'shape') else value
-            for value in values
-        )
+        return tuple(_entries(getattr(self, field.name)) for field in dataclasses.fields(self))  # type: ignore[arg-type]
+
+
+def _entries(value: Any) -> Any:
+    """Return an array, also in a tuple, as its shape and its entries."""
+    if isinstance(value, tuple):
+        return tuple(map(_entries, value))
+    return (value.shape, *value.ravel().tolist()) if hasattr(value, 'shape') else value
 
 
 def constant(name: str, value: Any, check: Check) -> Any:

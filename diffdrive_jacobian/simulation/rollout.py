@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -125,26 +125,28 @@ class Loops(Checked):
     """The arguments of `closed_loops`, checked."""
 
     law: Annotated[Controller, _controller]
-    starts: Any
-    goals: Any
-    gains: tuple[Any, ...]
+    starts: InitVar[Any]
+    goals: InitVar[Any]
+    gains: InitVar[tuple[Any, ...]]
     rate: Positive = 50.0
     duration: Positive = 60.0
     arrival: Annotated[Arrival, _arrival] = field(default_factory=Arrival)
-    turning_gain: Any = 3.0
+    turning_gain: InitVar[Any] = 3.0
     limits: VelocityLimits = NO_LIMITS
-    r: Any = 0.033
-    L: Any = 0.16
+    r: InitVar[Any] = 0.033
+    L: InitVar[Any] = 0.16
     actuators: Annotated[Actuators, _actuators] = IDEAL
     shape: tuple[int, ...] = field(init=False)
     """Shape of the batch."""
     columns: Columns = field(init=False)
-    """The same with the robots of the batch in one axis."""
+    """What may differ between robots, with the robots of the batch in one axis."""
 
-    def __post_init__(self) -> None:
+    def __post_init__(
+        self, starts: Any, goals: Any, gains: tuple[Any, ...], turning_gain: Any, r: Any, L: Any
+    ) -> None:
         """Check every value."""
         super().__post_init__()
-        starts, goals = array('starts', self.starts, 3), array('goals', self.goals, 'm')
+        starts, goals = array('starts', starts, 3), array('goals', goals, 'm')
         size = goals.shape[-1]
         if size not in (2, 3) or (self.arrival.use_heading and size != 3):
             wanted = '(..., 3)' if self.arrival.use_heading else '(..., 2) or (..., 3)'
@@ -153,17 +155,17 @@ class Loops(Checked):
             raise ValueError(
                 f'duration must be below {MAX_STEPS / self.rate:g} s at that rate, got {self.duration:g}'
             )
-        gains = self.gains or tuple(gain.default for gain in self.law.gains)
+        gains = gains or tuple(gain.default for gain in self.law.gains)
         named = {
             **{f'gain {index}': array(f'gain {index}', one) for index, one in enumerate(gains)},
-            'turning_gain': array('turning_gain', self.turning_gain),
+            'turning_gain': array('turning_gain', turning_gain),
             'offset': floats('offset', self.arrival.offset),
             **{
                 name: floats(name, limit)
                 for name, limit in zip(self.limits.names(), self.limits.all(), strict=True)
             },
-            'r': positive('r', floats('r', self.r)),
-            'L': positive('L', floats('L', self.L)),
+            'r': positive('r', floats('r', r)),
+            'L': positive('L', floats('L', L)),
         }
         shapes = {name: value.shape for name, value in named.items()}
         shape = leading(starts=starts.shape[:-1], goals=goals.shape[:-1], **shapes)
@@ -285,14 +287,14 @@ class Rollout:
                 yield self._outcomes(ended)
                 robots.open = robots.open & ~ended
             left = np.count_nonzero(robots.open)
-            v, omega = self._command(step) if left else (None, None)
             if keep is not None:
                 keep(step, robots.rows[ended], robots.pose[:, ended].T, None, None)
-                if v is not None and omega is not None:
-                    going = robots.open
-                    keep(step, robots.rows[going], robots.pose[:, going].T, v[going], omega[going])
-            if v is None or omega is None:
+            if not left:
                 return
+            v, omega = self._command(step)
+            if keep is not None:
+                going = robots.open
+                keep(step, robots.rows[going], robots.pose[:, going].T, v[going], omega[going])
             if left < SHRINK * len(robots.rows):
                 still = np.flatnonzero(robots.open)
                 self.columns, self.robots = self.columns.some(still), robots.some(still)
@@ -314,13 +316,13 @@ class Rollout:
             distance = hypot(dx, dy)
             if np.any(offset):
                 distance = distance_to_goal.formula(x, y, theta, *goal[:2], offset)
-        there = near = distance <= arrival.xy_tolerance
-        stopped = arrival.stopped(*robots.twist)
-        if arrival.use_heading:
-            robots.turning |= near & stopped
-            there = robots.turning & arrival.faces(theta, goal[2])
-        robots.stopping = (there | near & ~robots.turning) & ~stopped
-        return there & stopped, distance > robots.too_far
+        near = distance <= arrival.xy_tolerance
+        heading = goal[2] if arrival.use_heading else 0.0
+        robots.turning, turns, arrived = arrival.progress(
+            near, robots.turning, robots.twist, theta, heading
+        )
+        robots.stopping = (near | robots.turning) & ~turns & ~arrived
+        return arrived, distance > robots.too_far
 
     def _command(self, step: int) -> tuple[Array, Array]:
         """Evaluate the law, and limit its twists."""

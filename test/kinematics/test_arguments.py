@@ -49,7 +49,7 @@ ELSEWHERE = {
     *('Sweep', 'SweepSetup', 'describe_sweep', 'sweep', 'sweep_table'),
     *('AccelerationLimits', 'Actuators', 'AxisLimits'),
     # Without checks: of values that were checked.
-    *('steady', 'follow', 'faces'),
+    *('steady', 'follow', 'progress'),
 }
 """Public names that are no functions of numbers, or tested in files of their own."""
 OPTIONAL = {'h', 'arrival', 'progress', 'commanded_at', 'seed', 'drift', 'threshold', 'q_dot_0'}

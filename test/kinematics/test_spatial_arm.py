@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -316,3 +318,13 @@ def test_wrong_arguments_are_named():
             call()
     with pytest.raises(ValueError, match='read-only'):
         UR5.a[0] = 1.0
+
+
+def test_arms_are_compared_and_copied_by_their_parameters():
+    assert dataclasses.replace(UR5) == UR5 != dataclasses.replace(UR5, d=0.1)
+    assert hash(dataclasses.replace(UR5)) == hash(UR5)
+    assert dataclasses.replace(UR5, prismatic=(2,)).slides.tolist() == [0, 0, 1, 0, 0, 0]
+    free = dataclasses.replace(UR5, limits=None)
+    assert free.limits is None
+    assert free != UR5
+    assert PlanarArm([1.0, 0.5]) == PlanarArm(np.array([1.0, 0.5])) != PlanarArm([1.0, 0.6])
