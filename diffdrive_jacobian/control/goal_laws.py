@@ -31,14 +31,15 @@ def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Num
     """Compute the twist that drives a unicycle to a position.
 
     `e = wrap(atan2(y_g - y, x_g - x) - theta)`, `omega = Kp e`, `v = Kv d cos(e)`, where d is the
-    distance. Both gains should be positive, which is not checked. In continuous time `d_dot = -Kv d
-    cos^2(e) <= 0`, so the distance never grows. With `Kp < Kv` the heading error converges to the e with
-    `sin(2 e)/(2 e) = Kp/Kv`, not to zero, and the robot spirals in; with `Kp = Kv` it goes to zero like
-    1/sqrt(t). Exactly on the goal, where the heading towards it is undefined, v and omega are zero.
+    distance. Both gains should be positive; as in document A's script others are not refused. In
+    continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never grows. With `Kp < Kv` the
+    heading error settles at one of the two e with `sin(2 e)/(2 e) = Kp/Kv`, and the robot spirals in;
+    with `Kp = Kv` it goes to zero like 1/sqrt(t). Exactly on the goal, where the heading towards it is
+    undefined, v and omega are zero.
 
-    Sampled at a rate, the robot arrives with `Kp < 2 rate` and `Kv < rate`; if commands take effect up
-    to one sample late, with `Kp + Kv < rate`. Recommended is `Kp + Kv <= rate / 2` (doc/mathematics.md,
-    "Sampling").
+    If commands are held for a sample, 1/rate, the robot arrives if `Kp < 2 rate` and `Kv < rate`. If
+    they also take effect up to one sample late, it arrives if `Kp + Kv < rate`. Recommended: `Kp + Kv <=
+    rate / 2` (doc/mathematics.md, "Sampling").
 
     Args:
         state: Pose of the robot, shape (..., 3).
@@ -82,9 +83,10 @@ def turn_in_place(theta: Number, heading: Number, Kp: Number) -> tuple[Number, N
     """Compute the twist that turns to a heading by the smaller angle.
 
     `v = 0`, `omega = Kp wrap(heading - theta)`, of headings (rad) and the gain Kp (1/s), each of shape
-    (...); a negative gain, which is not refused, turns away. Sampled at a rate, it converges with `Kp <
-    2 rate`; if commands take effect up to one sample late, from rest with `Kp < rate`. (A robot that
-    turns already may swing about the opposite heading for ever.) Recommended is `Kp <= rate / 2`.
+    (...); a negative gain, which is not refused, turns away. If commands are held for a sample, 1/rate,
+    it converges if `Kp < 2 rate`; if they also take effect up to one sample late, if `Kp < rate` and the
+    robot is at rest first. (One that turns may swing about the opposite heading for ever.) Recommended:
+    `Kp <= rate / 2`.
     """
     return 0.0, Kp * wrap(heading - theta)
 
@@ -101,11 +103,12 @@ def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Num
 
     As wheel speeds the law is `w = J_d^-1 k (goal - p_d)`. Here it is the body twist `u = J_w w`: `v = k
     a`, `omega = k b / d`, where `[a, b]` is the vector from the point to the goal in the body frame. The
-    distance D of the point from the goal decays as exp(-k t), whatever the heading. The point comes to
-    rest on the goal, the axle centre at a distance |d| from it. Sampled at a rate, it decays about so,
-    and the point arrives, with `k D < 2 |d| rate` and `k < rate`; if commands take effect up to one
-    sample late, with `k (1 + D / |d|) < rate`. With a shorter offset the robot turns too far when the
-    goal is far away.
+    distance rho of the point from the goal decays as exp(-k t), whatever the heading. The point comes to
+    rest on the goal, the axle centre at a distance |d| from it.
+
+    If commands are held for a sample, 1/rate, the point arrives if `k rho < 2 |d| rate` and `k < rate`;
+    if they also take effect up to one sample late, if `k (1 + rho / |d|) < rate`. With a shorter offset
+    the robot turns too far in one sample while the goal is far away.
 
     Args:
         state: Pose of the robot, shape (..., 3).
@@ -146,7 +149,8 @@ OFFSET_POINT = Controller(
 # --- To a position and a heading
 
 STEEPEST = 2.741
-"""pi times the largest slope of sin(2 alpha)/(2 alpha): that of the part of `go_to_pose` with h [-]."""
+"""Largest slope of `phi sin(2 alpha)/(2 alpha)` over alpha for |phi| <= pi [-]: it bounds what `Kv h
+phi` adds to `|d omega / d alpha|` in `go_to_pose`."""
 
 
 @formula('(3),(3),(),(),() -> (),()', Kp=positive, Kv=positive, h=positive)
@@ -155,17 +159,17 @@ def go_to_pose(
 ) -> tuple[Number, Number]:
     """Compute the twist that drives a unicycle to a position and a heading.
 
-    Polar coordinates about the goal: the distance rho, and the direction b from the robot to the goal
-    relative to both headings, `alpha = wrap(b - theta)` and `phi = wrap(b - theta_goal)`. The heading
-    error `theta - theta_goal = phi - alpha` is zero where both are. A unicycle moves as
+    rho is the distance to the goal, alpha its bearing as seen from the robot's heading, and phi the same
+    bearing as seen from the goal's heading. The heading error `theta - theta_goal = phi - alpha` is zero
+    where both are. A unicycle moves as
 
         rho_dot = -v cos(alpha),  alpha_dot = v sin(alpha) / rho - omega,  phi_dot = v sin(alpha) / rho
 
     The law is `v = Kv rho cos(alpha)`, as in document A's law, and `omega = Kp alpha + Kv cos(alpha)
     sin(alpha)/alpha (alpha + h phi)`, in which h weights phi. In continuous time `V = rho^2 + alpha^2 +
     h phi^2` never grows, as `V_dot = -2 Kv rho^2 cos^2(alpha) - 2 Kp alpha^2`, and all three converge to
-    zero. Exactly on the goal's position, where b is undefined, v and omega are zero, with any heading:
-    then `turn_in_place` turns to it.
+    zero. Exactly on the goal's position, where there is no bearing, v and omega are zero, with any
+    heading: then `turn_in_place` turns to it.
 
     Near the goal `rho_dot = -Kv rho`, `alpha_dot = -Kp alpha - Kv h phi` and `phi_dot = Kv alpha`. So
     alpha and phi oscillate with the frequency `Kv sqrt(h)`, damped by Kp. They converge before rho with
@@ -173,9 +177,9 @@ def go_to_pose(
     goal lies behind, the robot backs up while it turns to it and then drives forwards; if it may not
     back up, it turns first.
 
-    Sampled at a rate, with `Kp > 2 Kv`, the robot arrives with `K = Kp + Kv (1 + 2.74 h) < 2 rate`; if
-    commands take effect up to one sample late, with `K < rate`. Recommended is `K <= rate / 2`. With the
-    default h, K is at most `6.5 Kp`.
+    With `Kp > 2 Kv`, and commands that are held for a sample, 1/rate, the robot arrives if `K = Kp + Kv
+    (1 + 2.741 h) < 2 rate`; if they also take effect up to one sample late, if `K < rate`. Recommended:
+    `K <= rate / 2`. With the default h, K is then below `6.5 Kp`.
 
     Args:
         state: Pose of the robot, shape (..., 3).

@@ -7,9 +7,9 @@ columns, and the rows of E's inverse, are exchanged here.
 
     w --J_w--> u --S(theta)--> q_dot
 
-`@formula('(),() -> (2,2)', r=positive)` says that a function of two numbers, of which r must be
-positive, returns a 2x2 matrix, an array. `f.formula(...)` is the same function, without checks, of
-numbers that were checked (`numerics.formula`).
+`@formula('(),() -> (2,2)', r=positive, L=positive)` says that a function of two numbers, both positive,
+returns a 2x2 matrix, an array. `f.formula(...)` is the same function without checks, of numbers that
+were checked (`numerics.formula`).
 
 Everything broadcasts over leading axes. A radius or separation that is not positive and finite, an
 angle or speed that is not finite, shapes that do not broadcast, and terms or results that overflow raise
@@ -200,12 +200,11 @@ def wheel_centres(pose: Vector, L: Number) -> Rows:
 
 @formula('(),(3),() -> (2,2)', L=positive)
 def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
-    """Return the velocities of the centres of both wheels: right `v_C + L/2 theta_dot e_f`, left `-`
-    (E).
+    """Return the velocities of the centres of both wheels (E).
 
-    With the forward unit vector `e_f = [cos, sin]`; this is `v_C` and the angular velocity times the
-    vector from the axle centre C to the wheel. Their mean is the velocity of C. Of wheels that roll
-    without slip they are `r omega_R e_f` and `r omega_L e_f`.
+    Right `v_C + L/2 theta_dot e_f`, left `v_C - L/2 theta_dot e_f`, with `e_f = [cos, sin]`: that is
+    `v_C + omega × r`, with r from the axle centre C to the wheel. Their mean is the velocity of C. Of
+    wheels that roll without slip they are `r omega_R e_f` and `r omega_L e_f`.
 
     For headings theta, shape (...) (rad), velocities `q_dot = [x_dot, y_dot, theta_dot]` in the world,
     shape (..., 3) (m/s, m/s, rad/s), and L, shape (...) (m), the result has the shape (..., 2, 2) (m/s):
@@ -221,7 +220,7 @@ def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
 
 @formula('() -> (1,3)')
 def no_lateral_slip_constraint(theta: Number) -> Rows:
-    """Return the row `A(q) = [sin, -cos, 0]` with `A(q) q_dot = 0`, no lateral slip (A, E).
+    """Return the row `a(theta) = [sin, -cos, 0]` with `a q_dot = 0`: no lateral slip (A, E, as A(q)).
 
     For headings theta, shape (...) (rad), the result has the shape (..., 1, 3). Its null space is the
     range of S(theta). In the body frame it is `[0, -1, 0]` for every heading.
@@ -265,7 +264,8 @@ def controllability_matrix(theta: Number) -> Rows:
 def rolling_constraints(theta: Number, r: Number, L: Number) -> tuple[Rows, Rows]:
     """Return the constraints of two rolling wheels, a pair with `A_q q_dot = A_w w` (E).
 
-    Rows: no lateral slip, pure rolling of the right wheel, pure rolling of the left one. `A_q` is
+    Rows: no lateral slip, `x_dot sin - y_dot cos = 0`, and pure rolling of the right and of the left
+    wheel, `x_dot cos + y_dot sin ± L/2 theta_dot = r omega_R, r omega_L`. `A_q` is
     invertible, its determinant is -L, and `A_q^-1 A_w` is the chain `S(theta) J_w`. For headings theta
     (rad), r and L (m), each of shape (...), they have the shapes (..., 3, 3) and (..., 3, 2).
     """

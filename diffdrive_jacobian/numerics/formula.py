@@ -70,74 +70,13 @@ def formula(signature: str, **checks: Check) -> _Decorator:
         signature: Shapes of the arguments and the results, such as `(3),() -> (),()`.
         checks: What is required of an argument, by its name; of others, that they are finite.
     """
-    inputs, outputs = map(_shapes, signature.split('->'))
-    of_matrices = any(len(shape) > 1 for shape in inputs)
-    words = {size for shape in inputs for size in shape if isinstance(size, str) and len(size) > 1}
 
     def decorate(body: Callable[..., Any]) -> Any:
-        called = inspect.signature(body)
-        shapes = dict(zip((name for name in called.parameters if name != 'self'), inputs, strict=True))
-        optional = {name for name in shapes if called.parameters[name].default is None}
-        if unknown := checks.keys() - shapes.keys():
-            raise TypeError(f'checks must be of {", ".join(shapes)}, got {", ".join(sorted(unknown))}')
-        if words and 'self' not in called.parameters:
-            raise TypeError(f'a size by a name, {min(words)!r}, is for methods, got {body.__name__}')
-        *others, last = shapes
-        given = f'{", ".join(others)} and {last}' if others else last
-        overflow = f'{given} must give a finite result, but it overflows or is undefined'
+        equation = _Equation(body, signature, checks)
 
         @functools.wraps(body)
         def checked(*args: Any, **kwargs: Any) -> Any:
-            try:
-                bound = called.bind(*args, **kwargs)
-            except TypeError as error:
-                raise TypeError(f'{body.__name__}: {error}; it takes {given}') from None
-            arguments = bound.arguments
-            sizes: dict[Size, int] = {word: getattr(arguments['self'], word) for word in words}
-            arrays: dict[str, Array] = {}
-            leads: dict[str, tuple[int, ...]] = {}
-            for name, shape in shapes.items():
-                if name not in arguments:
-                    continue
-                value = arguments[name]
-                if value is None and name in optional:
-                    del arguments[name]
-                    continue
-                # The first argument with a letter decides on its size.
-                array = shaped(name, value, *(sizes.get(size, size) for size in shape))
-                checks.get(name, finite)(name, array)
-                axes = array.ndim - len(shape)
-                leads[name] = array.shape[:axes]
-                sizes |= zip(shape, array.shape[axes:], strict=True)
-                arrays[name] = array
-            batch = leading(**leads)
-            for name, array in arrays.items():
-                arguments[name] = (
-                    entries_first(array, len(shapes[name]), len(batch))
-                    if of_matrices
-                    else _components(array, len(shapes[name]), batch)
-                )
-            with np.errstate(all='ignore'):
-                try:
-                    results = body(*bound.args, **bound.kwargs)
-                except ArithmeticError:
-                    raise ValueError(overflow) from None
-                except ValueError:
-                    # Floats raise where arrays become NaN, as in `math.sin(inf)`. With arrays a mistake
-                    # in the body is raised again, and what it refuses. If nothing is, the result is
-                    # undefined.
-                    arguments.update({name: np.asarray(arguments[name]) for name in arrays})
-                    body(*bound.args, **bound.kwargs)
-                    raise ValueError(overflow) from None
-            packed = [
-                _packed(result, shape, sizes, batch)
-                for result, shape in zip(
-                    results if len(outputs) > 1 else [results], outputs, strict=True
-                )
-            ]
-            if not all(np.isfinite(one).all() for one in packed):
-                raise ValueError(overflow)
-            return tuple(packed) if len(outputs) > 1 else packed[0]
+            return equation(args, kwargs)
 
         def floats(*args: Any, **kwargs: Any) -> Any:
             # Replaces itself when it is called first: the body may call what is defined after it.
@@ -151,6 +90,96 @@ def formula(signature: str, **checks: Check) -> _Decorator:
     return cast('_Decorator', decorate)
 
 
+class _Equation:
+    """A body with the shapes and the checks of its arguments."""
+
+    def __init__(self, body: Callable[..., Any], signature: str, checks: Mapping[str, Check]) -> None:
+        self.body, self.checks, self.called = body, checks, inspect.signature(body)
+        inputs, self.outputs = map(_shapes, signature.split('->'))
+        names = [name for name in self.called.parameters if name != 'self']
+        if len(names) != len(inputs):
+            raise TypeError(f'{signature} must have the arguments {", ".join(names)}, got {len(inputs)}')
+        self.shapes = dict(zip(names, inputs, strict=True))
+        if unknown := checks.keys() - self.shapes.keys():
+            raise TypeError(f'checks must be of {", ".join(names)}, got {", ".join(sorted(unknown))}')
+        self.of_matrices = any(len(shape) > 1 for shape in inputs)
+        self.optional = {name for name in names if self.called.parameters[name].default is None}
+        self.attributes = {
+            size for shape in inputs for size in shape if isinstance(size, str) and len(size) > 1
+        }
+        if self.attributes and 'self' not in self.called.parameters:
+            name = min(self.attributes)
+            raise TypeError(f'a size by a name, {name!r}, is for methods, got {body.__name__}')
+        *others, last = names
+        self.names = f'{", ".join(others)} and {last}' if others else last
+
+    def __call__(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Check the arguments, evaluate the body for one robot or for a batch, and check the results."""
+        try:
+            bound = self.called.bind(*args, **kwargs)
+        except TypeError as error:
+            raise TypeError(f'{self.body.__name__}: {error}; it takes {self.names}') from None
+        owner = bound.arguments.get('self')
+        sizes: dict[Size, int] = {name: getattr(owner, name) for name in self.attributes}
+        batch = self._check(bound.arguments, sizes)
+        results = self._evaluate(bound, batch)
+        packed = [
+            _packed(result, shape, sizes, batch)
+            for result, shape in zip(
+                results if len(self.outputs) > 1 else [results], self.outputs, strict=True
+            )
+        ]
+        if not all(np.isfinite(one).all() for one in packed):
+            raise self._overflow()
+        return tuple(packed) if len(self.outputs) > 1 else packed[0]
+
+    def _check(self, arguments: dict[str, Any], sizes: dict[Size, int]) -> tuple[int, ...]:
+        """Replace arguments by arrays. Returns the axes to which those in front broadcast."""
+        leads: dict[str, tuple[int, ...]] = {}
+        for name in [name for name in self.shapes if name in arguments]:
+            if arguments[name] is None and name in self.optional:
+                del arguments[name]
+                continue
+            shape = self.shapes[name]
+            # The first argument with a letter sets its size, with which later ones must agree.
+            array = shaped(name, arguments[name], *(sizes.get(size, size) for size in shape))
+            self.checks.get(name, finite)(name, array)
+            own = array.ndim - len(shape)
+            leads[name] = array.shape[:own]
+            sizes |= zip(shape, array.shape[own:], strict=True)
+            arguments[name] = array
+        return leading(**leads)
+
+    def _evaluate(self, bound: inspect.BoundArguments, batch: tuple[int, ...]) -> Any:
+        """Return what the body returns."""
+        arguments = bound.arguments
+        given = [name for name in self.shapes if name in arguments]
+        for name in given:
+            array, axes = arguments[name], len(self.shapes[name])
+            if self.of_matrices:
+                arguments[name] = entries_first(array, axes, len(batch))
+            elif not batch:
+                arguments[name] = array.tolist()
+            elif axes:
+                arguments[name] = list(np.moveaxis(array, -1, 0))
+        with np.errstate(all='ignore'):
+            try:
+                try:
+                    return self.body(*bound.args, **bound.kwargs)
+                except (ArithmeticError, ValueError):
+                    # Floats raise where arrays become infinite or NaN, as `math.sin(inf)` and `1.0 /
+                    # 0.0`, also in a branch of `where` that is not taken. So arrays decide. What the
+                    # body itself refuses, and mistakes in it, are raised again.
+                    for name in given:
+                        arguments[name] = np.asarray(arguments[name])
+                    return self.body(*bound.args, **bound.kwargs)
+            except ArithmeticError:
+                raise self._overflow() from None
+
+    def _overflow(self) -> ValueError:
+        return ValueError(f'{self.names} must give a finite result, but it overflows or is undefined')
+
+
 def _shapes(side: str) -> list[tuple[Size, ...]]:
     """Return the shapes in one side of a signature."""
     return [
@@ -159,22 +188,16 @@ def _shapes(side: str) -> list[tuple[Size, ...]]:
     ]
 
 
-def _components(array: Array, entries: int, batch: tuple[int, ...]) -> Any:
-    """Return a number or the entries of a vector, as floats or as arrays of a batch."""
-    if not batch:
-        return array.tolist()
-    return list(np.moveaxis(array, -1, 0)) if entries else array
+def entries_first(array: Array, own_axes: int, batch_axes: int) -> Array:
+    """Move the last axes, its own, to the front, before those of the batch, which are so many."""
+    padded = array.reshape((1,) * (batch_axes + own_axes - array.ndim) + array.shape)
+    order = *range(batch_axes, padded.ndim), *range(batch_axes)
+    return np.asarray(padded.transpose(order), order='C')
 
 
-def entries_first(array: Array, entries: int, axes: int) -> Array:
-    """Move the last axes, as many as `entries`, to the front, before the axes of the batch."""
-    padded = array.reshape((1,) * (axes + entries - array.ndim) + array.shape)
-    return np.asarray(padded.transpose(*range(axes, padded.ndim), *range(axes)), order='C')
-
-
-def entries_last(array: Array, entries: int) -> Array:
-    """Move the first axes, as many as `entries`, behind those of the batch."""
-    return np.asarray(array.transpose(*range(entries, array.ndim), *range(entries)), order='C')
+def entries_last(array: Array, own_axes: int) -> Array:
+    """Move the first axes, its own, behind those of the batch."""
+    return np.asarray(array.transpose(*range(own_axes, array.ndim), *range(own_axes)), order='C')
 
 
 def _packed(

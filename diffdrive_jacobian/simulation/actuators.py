@@ -3,11 +3,14 @@
 A commanded twist `u = [v, omega]` passes
 
 1. the delay;
+
 2. the limits of the acceleration, those of diff_drive_controller, but with one time law s(t) from 0 to 1
    for both speeds, `u(t) = u_0 + (u_1 - u_0) s(t)`, so that the curvature is kept;
-3. the largest speed of each motor, which the robot does not know: the curvature is not kept; 4. the lag,
-`tau du/dt = u_reached - u`, with what step 3 leaves: that of both wheels, and so of v and omega,
-   which are linear in the wheel speeds.
+
+3. the largest speed of each motor, which the robot does not know: the curvature is not kept;
+
+4. the lag of what step 3 leaves, `tau du/dt = u_reached - u`. Both wheels have the same tau, so v and
+   omega, which are linear in the wheel speeds, lag alike.
 
 So v and omega are `a + b t + c exp(-t / tau)` in each piece of time (`speeds`).
 
@@ -125,12 +128,10 @@ class AccelerationLimits(Checked):
         v_zero, omega_zero = _zero(v_0, dv), _zero(omega_0, domega)
         s, (v, omega) = 0.0, start
         for s_end in (minimum(v_zero, omega_zero), maximum(v_zero, omega_zero), 1.0):
-            v_end = where(s_end == v_zero, 0.0, v_0 + dv * s_end)
-            omega_end = where(s_end == omega_zero, 0.0, omega_0 + domega * s_end)
-            # 1.0 also stands for a speed that does not change its sign: the end is the target.
-            v_end, omega_end = where(s_end == 1.0, v_1, v_end), where(s_end == 1.0, omega_1, omega_end)
-            # The time for s from 0 to 1 at the rates of this part, in the middle of which no speed is
-            # zero; where there is no limit, none.
+            v_end = _speed_at(s_end, v_zero, v_0, v_1)
+            omega_end = _speed_at(s_end, omega_zero, omega_0, omega_1)
+            # The time for s from 0 to 1 at the rates of this part; where there is no limit, none. They
+            # depend on the signs of the speeds, which are those in the middle of the part.
             seconds = maximum(
                 abs(dv) / self.v.rate((v + v_end) / 2.0, dv),
                 abs(domega) / self.omega.rate((omega + omega_end) / 2.0, domega),
@@ -142,10 +143,16 @@ class AccelerationLimits(Checked):
 
 
 def _zero(speed: Number, change: Number) -> Number:
-    """Return the s at which a speed is zero; 1.0 if its sign does not change."""
+    """Return the s at which a speed is zero; 1.0: its sign does not change."""
     end = speed + change
     crosses = (minimum(speed, end) < 0.0) & (maximum(speed, end) > 0.0)
     return where(crosses, -speed / where(crosses, change, 1.0), 1.0)
+
+
+def _speed_at(s: Number, zero: Number, start: Number, target: Number) -> Number:
+    """Return a speed at s, exactly zero or the target where it should be."""
+    speed = where(s == zero, 0.0, start + (target - start) * s)
+    return where(s == 1.0, target, speed)
 
 
 SETTLING = 36.0
@@ -239,7 +246,7 @@ class Actuators(Checked):
             max(-most_left, min(most_left, left)) + 0.0,
         )
 
-    def stopping_distance(self, twist: Twist, wheels: Wheels | None = None) -> Twist:
+    def stopping_distance(self, twist: Twist, wheels: Wheels | None = None) -> tuple[float, float]:
         """Return how far a robot with a held twist rolls and turns after zero is commanded (m, rad).
 
         Without `wheels` the limit of their acceleration is left out. The largest speeds of the motors

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.numerics.checks import positive
-from diffdrive_jacobian.numerics.elementary import cos, sin
+from diffdrive_jacobian.numerics.elementary import cos, sin, where
 from diffdrive_jacobian.numerics.formula import formula
 
 
@@ -181,3 +181,12 @@ def test_sizes_by_a_name_are_for_methods():
 def test_checks_are_of_arguments():
     with pytest.raises(TypeError, match='checks must be of r, L, got l'):
         formula('(),() -> ()', l=positive)(lambda r, L: r * L)
+
+
+def test_a_branch_that_is_not_taken_does_no_harm():
+    @formula('() -> ()')
+    def inverse(x):
+        return where(x > 0.0, 1.0 / x, 0.0)
+
+    assert inverse(0.0) == 0.0
+    assert inverse([0.0, 2.0]).tolist() == [0.0, 0.5]

@@ -139,7 +139,7 @@ def test_the_description_is_empty_where_nothing_is_to_be_said():
     assert rolls_on(ACTUATORS, (0.2, 0.0)) == (
         '; the robot rolls on for about 0.260 m and turns by 0.000 rad'
     )
-    assert rolls_on(None, (0.2, 0.0)) == rolls_on(ACTUATORS, (0.0, 0.0)) == ''
+    assert rolls_on(ACTUATORS, (0.0, 0.0)) == ''
     assert rolls_on(Actuators(), (0.2, 0.0)) == rolls_on(ACTUATORS, (math.nan, 0.0)) == ''
 
 
