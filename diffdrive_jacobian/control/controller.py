@@ -97,6 +97,7 @@ class Gain(Checked):
             raise ValueError(f'usual must be (first, last) with first < last, got {self.usual}')
         self.check(first)
         self.check(last)
+        object.__setattr__(self, 'usual', (first, last))
 
     def shares_range(self, other: Gain) -> bool:
         """Return whether a gain of the same name allows the same values, so that it can be shared."""

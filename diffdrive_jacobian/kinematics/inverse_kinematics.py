@@ -349,8 +349,9 @@ def norm(vectors: Floats) -> Floats:
 
 
 def _square(J: Floats) -> Floats:
-    """Return `|J|^2` in the norm of Frobenius, shape (k,)."""
-    return np.asarray(np.einsum('mnk,mnk->k', J, J))
+    """Return `|J|^2` in the norm of Frobenius, shape (k,); infinite where it is too large for `svd`."""
+    square = np.einsum('mnk,mnk->k', J, J)
+    return np.where(np.isfinite(2.0 * square), square, np.inf)
 
 
 def _quotient(change: Floats, width: Floats) -> Floats:

@@ -349,13 +349,16 @@ def manipulability_gradient(jacobian: Callable[[Array], ArrayLike], q: ArrayLike
     q = array('q', q, 'n')
     steps = STEP * np.eye(q.shape[-1])
     around = q[..., np.newaxis, :]
-    above, below = manipulability(jacobian(around + steps)), manipulability(jacobian(around - steps))
+    up, down = around + steps, around - steps
+    above, below = manipulability(jacobian(up)), manipulability(jacobian(down))
     if np.shape(above) != q.shape:
         raise ValueError(
             f'jacobian must return one Jacobian for each configuration, shape (*{q.shape}, m, n), got '
             f'manipulabilities of shape {np.shape(above)}'
         )
-    return np.asarray((above - below) / (2.0 * STEP))
+    # The distance that is left after rounding.
+    width = np.diagonal(up - down, axis1=-2, axis2=-1)
+    return np.asarray((above - below) / np.where(width > 0.0, width, np.inf))
 
 
 class Ellipsoid(NamedTuple):

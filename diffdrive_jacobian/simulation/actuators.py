@@ -43,7 +43,7 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 SHORTEST = 1e-9
 """Shortest duration of a part of a transition, the resolution of times (s)."""
-Speeds: TypeAlias = tuple[float, float]
+WheelSpeeds: TypeAlias = tuple[float, float]
 """`(omega_R, omega_L)` (rad/s)."""
 
 
@@ -162,7 +162,7 @@ SETTLING = 36.0
 class Wheels(Protocol):
     """The wheels of a robot, as `RobotModel` has them."""
 
-    def wheel_speeds(self, v: float, omega: float) -> Speeds:
+    def wheel_speeds(self, v: float, omega: float) -> WheelSpeeds:
         """Return the wheel speeds of a twist."""
 
     def twist(self, omega_R: float, omega_L: float) -> Twist:
@@ -237,7 +237,7 @@ class Actuators(Checked):
         name = f'max_{wheel}_speed'
         return replace(self, **{name: min(speed, getattr(self, name))})
 
-    def limited(self, speeds: Speeds) -> Speeds:
+    def limited(self, speeds: WheelSpeeds) -> WheelSpeeds:
         """Return the speeds that the motors can reach."""
         (right, left), most_right, most_left = speeds, self.max_right_speed, self.max_left_speed
         # Of a dead motor not -0.0.

@@ -34,7 +34,7 @@ from diffdrive_jacobian.numerics.checks import (
     triple,
 )
 from diffdrive_jacobian.simulation.actuators import STANDSTILL as STANDSTILL
-from diffdrive_jacobian.simulation.actuators import Drive, Speeds
+from diffdrive_jacobian.simulation.actuators import Drive, WheelSpeeds
 from diffdrive_jacobian.simulation.exact_moments import Entries, Moments, gaussian, propagated_moments
 from diffdrive_jacobian.simulation.odometry_noise import twist_covariance
 from diffdrive_jacobian.simulation.quadrature_moments import moments_along
@@ -149,7 +149,7 @@ class Robot:
         return self
 
     def __repr__(self) -> str:
-        """Return a constructor call with the values."""
+        """Return the values, without the rest of a motion that takes time, as a constructor call."""
         names = (
             'model',
             'stamp',
@@ -227,7 +227,7 @@ class Robot:
         return moments
 
     @property
-    def wheel_angles(self) -> Speeds:
+    def wheel_angles(self) -> WheelSpeeds:
         """`(right, left)`, unwrapped (rad)."""
         return self._state.wheel_angles
 
@@ -264,7 +264,7 @@ class Robot:
         return truth.twist(drive.motion, self._stamp, L, k)
 
     @property
-    def wheel_speeds(self) -> Speeds:
+    def wheel_speeds(self) -> WheelSpeeds:
         """`(omega_R, omega_L)` (rad/s), by the inverse wheel Jacobian."""
         if self._drive is None:
             return (self._steady or self._find_steady()).wheel_speeds
@@ -344,7 +344,7 @@ class Robot:
             state = state._replace(truth=_truth(self._model, place))
         return here._with(here._stamp, state)
 
-    def reported(self, pose: Pose, wheel_angles: Speeds, twist: Twist) -> Robot:
+    def reported(self, pose: Pose, wheel_angles: WheelSpeeds, twist: Twist) -> Robot:
         """Return this robot as its sensors report it, with the same covariance and the same truth.
 
         Raises:

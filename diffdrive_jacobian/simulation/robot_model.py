@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.saturation import ROUNDING, VelocityLimits, scaled_to_limits
 from diffdrive_jacobian.numerics.checks import Checked, NotNegative, Positive, instance, pair
-from diffdrive_jacobian.simulation.actuators import IDEAL, Actuators, Duration, Speeds
+from diffdrive_jacobian.simulation.actuators import IDEAL, Actuators, Duration, WheelSpeeds
 from diffdrive_jacobian.simulation.odometry_noise import spectral_densities
 from diffdrive_jacobian.simulation.slip import Drift
 
@@ -27,7 +27,7 @@ def _limits(name: str, value: Any) -> VelocityLimits:
 class Steady(NamedTuple):
     """What stays the same while a robot keeps its twist."""
 
-    wheel_speeds: Speeds
+    wheel_speeds: WheelSpeeds
     """`(omega_R, omega_L)` (rad/s)."""
     densities: tuple[float, float, float]
     """Spectral densities vv, vw, ww of the noise of the twist."""
@@ -99,7 +99,7 @@ class RobotModel(Checked):
             self.wheel_radius * self.left_wheel_radius_multiplier,
         )
 
-    def wheel_speeds(self, v: float, omega: float) -> Speeds:
+    def wheel_speeds(self, v: float, omega: float) -> WheelSpeeds:
         """Return the wheel speeds `(omega_R, omega_L)` of a twist of floats (rad/s).
 
         Raises:

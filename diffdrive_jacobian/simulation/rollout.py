@@ -77,12 +77,6 @@ def _controller(name: str, value: Any) -> Controller:
     return Controller(name='law', law=law, gains=())
 
 
-def _arrival(name: str, value: Any) -> Arrival:
-    """Require an arrival criterion; None: its defaults."""
-    arrival: Arrival = instance(name, Arrival() if value is None else value, Arrival)
-    return arrival
-
-
 def _actuators(name: str, value: Any) -> Actuators:
     """Require actuators whose motors are fast enough."""
     actuators: Actuators = instance(name, value, Actuators)
@@ -130,12 +124,14 @@ class Loops(Checked):
     gains: InitVar[tuple[Any, ...]]
     rate: Positive = 50.0
     duration: Positive = 60.0
-    arrival: Annotated[Arrival, _arrival] = field(default_factory=Arrival)
+    arrival: Arrival | None = None
     turning_gain: InitVar[Any] = 3.0
     limits: VelocityLimits = NO_LIMITS
     r: InitVar[Any] = 0.033
     L: InitVar[Any] = 0.16
     actuators: Annotated[Actuators, _actuators] = IDEAL
+    criterion: Arrival = field(init=False)
+    """When a robot has arrived, but for the offset."""
     shape: tuple[int, ...] = field(init=False)
     """Shape of the batch."""
     columns: Columns = field(init=False)
@@ -147,19 +143,20 @@ class Loops(Checked):
         """Check every value."""
         super().__post_init__()
         starts, goals = array('starts', starts, 3), array('goals', goals, 'm')
+        gains = gains or tuple(gain.default for gain in self.law.gains)
+        arrival = self._arrival(gains)
         size = goals.shape[-1]
-        if size not in (2, 3) or (self.arrival.use_heading and size != 3):
-            wanted = '(..., 3)' if self.arrival.use_heading else '(..., 2) or (..., 3)'
+        if size not in (2, 3) or (arrival.use_heading and size != 3):
+            wanted = '(..., 3)' if arrival.use_heading else '(..., 2) or (..., 3)'
             raise ValueError(f'goals must have shape {wanted}, got {goals.shape}')
         if not self.duration * self.rate < MAX_STEPS:
             raise ValueError(
                 f'duration must be below {MAX_STEPS / self.rate:g} s at that rate, got {self.duration:g}'
             )
-        gains = gains or tuple(gain.default for gain in self.law.gains)
         named = {
             **{f'gain {index}': array(f'gain {index}', one) for index, one in enumerate(gains)},
             'turning_gain': array('turning_gain', turning_gain),
-            'offset': floats('offset', self.arrival.offset),
+            'offset': floats('offset', arrival.offset),
             **{
                 name: floats(name, limit)
                 for name, limit in zip(self.limits.names(), self.limits.all(), strict=True)
@@ -184,8 +181,17 @@ class Loops(Checked):
             r=r,
             L=L,
         )
-        object.__setattr__(self, 'shape', shape)
-        object.__setattr__(self, 'columns', columns)
+        for name, value in (('shape', shape), ('columns', columns), ('criterion', arrival)):
+            object.__setattr__(self, name, value)
+
+    def _arrival(self, gains: tuple[Any, ...]) -> Arrival:
+        """Return the arrival criterion; where none is given that which suits the controller."""
+        if self.arrival is not None:
+            return self.arrival
+        names, offset = self.law.gain_names, 0.0
+        if self.law.offset and len(gains) == len(names):
+            offset = gains[names.index(self.law.offset)]
+        return Arrival(use_heading=self.law.takes_heading, offset=offset)
 
     @property
     def steps(self) -> int:
@@ -307,7 +313,7 @@ class Rollout:
 
     def _check_ends(self) -> tuple[Mask, Mask]:
         """Return which robots have arrived, and which were driven away by their law."""
-        robots, arrival = self.robots, self.loops.arrival
+        robots, arrival = self.robots, self.loops.criterion
         goal, offset = self.columns.goals, self.columns.offset
         x, y, theta = robots.pose
         with np.errstate(over='ignore', invalid='ignore'):
@@ -340,7 +346,7 @@ class Rollout:
                 f'law must return (v, omega), each of shape () or {(count,)}{state_too}, '
                 f'got {twist!r:.80}'
             ) from error
-        if loops.arrival.use_heading and robots.turning.any():
+        if robots.turning.any():
             turn = wrap(columns.goals[2] - robots.pose[2])
             v = np.where(robots.turning, 0.0, v)
             omega = np.where(robots.turning, columns.turning_gain * turn, omega)

@@ -152,7 +152,9 @@ class Truth:
     def twist(self, motion: Profile, stamp: int, L: float, k: float) -> tuple[float, float]:
         """Return the true twist, the slip included, from a time (ns) on."""
         cell = _present(self._cell, motion, stamp)
-        piece = motion.between(motion.seconds(stamp), motion.seconds(cell.end))[0]
+        # None after years, when the rest of a cell is shorter than the resolution of its time.
+        pieces = motion.between(motion.seconds(stamp), motion.seconds(cell.end))
+        piece = pieces[0] if pieces else motion.pieces[-1].part(0.0, 1.0)
         rims = self._rims(piece, L)
         v, omega = self._body(0.0, self._slipping(cell, rims, piece.seconds, k)[0], L).twist(0.0)
         return v, omega
@@ -161,19 +163,19 @@ class Truth:
         self, cell: Cell, pose: Pose, motion: Profile, begin: int, end: int, L: float, k: float
     ) -> tuple[Pose, Cell]:
         """Return the pose and the cell after a part of it, from `begin` to `end` (ns)."""
-        left = motion.seconds(end) - motion.seconds(begin)
+        remaining = motion.seconds(end) - motion.seconds(begin)
         for piece in motion.between(motion.seconds(begin), motion.seconds(cell.end)):
             rims = self._rims(piece, L)
             # The speed of the slip is that for the whole piece.
             slipping, slips = self._slipping(cell, rims, piece.seconds, k)
-            seconds = min(piece.seconds, left)
+            seconds = min(piece.seconds, remaining)
             pose = moved(pose, self._body(seconds, slipping, L))
-            right_wheel, left_wheel = (
+            right, left = (
                 wheel.after(rim, slip, seconds, k)
                 for wheel, rim, slip in zip(cell.wheels, rims, slips, strict=True)
             )
-            cell, left = cell._replace(wheels=(right_wheel, left_wheel)), left - seconds
-            if left <= 0.0:
+            cell, remaining = cell._replace(wheels=(right, left)), remaining - seconds
+            if remaining <= 0.0:
                 break
         return pose, cell
 

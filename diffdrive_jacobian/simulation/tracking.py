@@ -261,7 +261,7 @@ def follow_path(
         gains: Values of gains of the law, by name; None: their defaults.
         start: Pose of the robot, shape (3,); None: on the start of the path, along it.
         model: The robot; None: an ideal one.
-        settings: Speeds and distances; None: their defaults.
+        settings: WheelSpeeds and distances; None: their defaults.
         localised: Whether the law is given the true pose, as of a localisation, rather than that of the
             odometry.
         rate: Control rate (Hz).
@@ -281,7 +281,7 @@ def follow_path(
     values = SimpleNamespace(**{**vars(controller.defaults), **gains})
     for gain in controller.gains:
         gain.check(getattr(values, gain.name))
-    settings = PathSettings() if settings is None else settings
+    settings = instance('settings', PathSettings() if settings is None else settings, PathSettings)
     period = round(NANOSECONDS / between(0.0, NANOSECONDS, above=0.0, unit='Hz')('rate', rate))
     law, goals = controller.bind(values), find_controller('go_to_goal')
     law_of_goals = goals.bind(goals.defaults)

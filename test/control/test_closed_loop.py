@@ -235,6 +235,16 @@ def test_a_controller_without_gains_has_its_defaults():
     )
 
 
+def test_a_controller_arrives_with_its_heading_and_its_point():
+    start, goal = [0.0, 0.0, 0.0], [1.0, 0.0, 2.0]
+    found = closed_loops('pose', start, goal, 1.0, 1.0)
+    assert found.arrived
+    assert abs(found.pose[2] - 2.0) <= 0.02
+    offset = closed_loops('offset_point', start, [1.0, 0.0], 0.5, 0.3)
+    assert offset.arrived
+    assert offset.pose[0] == pytest.approx(0.7, abs=0.03)
+
+
 def test_other_gains_and_settings_than_there_are_are_named():
     with pytest.raises(ValueError, match='law rejects the starts, goals and gains: go_to_goal: missing'):
         closed_loops('go_to_goal', [0.0, 0.0, 0.0], [1.0, 0.0], 3.0)
