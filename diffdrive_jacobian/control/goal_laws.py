@@ -31,11 +31,11 @@ def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Num
     """Compute the twist that drives a unicycle to a position.
 
     `e = wrap(atan2(y_g - y, x_g - x) - theta)`, `omega = Kp e`, `v = Kv d cos(e)`, where d is the
-    distance. Both gains should be positive; as in document A's script others are not refused. In
-    continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never grows. With `Kp < Kv` the
-    heading error settles at one of the two e with `sin(2 e)/(2 e) = Kp/Kv`, and the robot spirals in;
-    with `Kp = Kv` it goes to zero like 1/sqrt(t). Exactly on the goal, where the heading towards it is
-    undefined, v and omega are zero.
+    distance (rho below). Both gains should be positive; as in document A's script others are not
+    refused. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never grows. With `Kp <
+    Kv` the heading error settles at one of the two e with `sin(2 e)/(2 e) = Kp/Kv`, and the robot
+    spirals in; with `Kp = Kv` it goes to zero like 1/sqrt(t). Exactly on the goal, where the heading
+    towards it is undefined, v and omega are zero.
 
     If commands are held for a sample, 1/rate, the robot arrives if `Kp < 2 rate` and `Kv < rate`. If
     they also take effect up to one sample late, it arrives if `Kp + Kv < rate`. Recommended: `Kp + Kv <=
@@ -71,8 +71,8 @@ GO_TO_GOAL = Controller(
     law=go_to_goal,
     summary="document A's law, to a position",
     advice=_go_to_goal_advice,
-    # |d omega / d theta| of the law, and kv, because driving changes the bearing by up to kv e per
-    # second.
+    # e_dot = -Kp e + Kv sin(e) cos(e): omega has the slope kp, and driving changes e by at most kv |e|
+    # per second. A command that is late must not outrun both.
     slope=lambda gains: gains.kp + gains.kv,
     boundary=Boundary(ratio=1.0, beyond='with a larger kv the robot spirals in'),
 )
@@ -141,7 +141,7 @@ OFFSET_POINT = Controller(
     gains=(KV, OFFSET),
     offset='offset',
     advice=_offset_point_advice,
-    # At the goal. At a distance it is larger by kv distance / |offset|.
+    # That at the goal. At the distance rho from it, it is kv (1 + rho / |offset|).
     slope=lambda gains: gains.kv,
 )
 
@@ -172,10 +172,10 @@ def go_to_pose(
     heading: then `turn_in_place` turns to it.
 
     Near the goal `rho_dot = -Kv rho`, `alpha_dot = -Kp alpha - Kv h phi` and `phi_dot = Kv alpha`. So
-    alpha and phi oscillate with the frequency `Kv sqrt(h)`, damped by Kp. They converge before rho with
-    `Kp > 2 Kv` and `h > Kp/Kv - 1`, which the default h is. A larger h leads to longer paths. If the
-    goal lies behind, the robot backs up while it turns to it and then drives forwards; if it may not
-    back up, it turns first.
+    alpha and phi oscillate with the frequency `Kv sqrt(h)`, damped by Kp. They converge before rho if
+    both roots of `s^2 + Kp s + Kv^2 h` are left of -Kv: with `Kp > 2 Kv` and `h > Kp/Kv - 1`, which the
+    default h is. A larger h leads to longer paths. If the goal lies behind, the robot backs up while it
+    turns to it and then drives forwards; if it may not back up, it turns first.
 
     With `Kp > 2 Kv`, and commands that are held for a sample, 1/rate, the robot arrives if `K = Kp + Kv
     (1 + 2.741 h) < 2 rate`; if they also take effect up to one sample late, if `K < rate`. Recommended:
@@ -240,11 +240,11 @@ LARGEST_TURN = 7.0 / 8.0 * tau
 """Largest turn per sample that is left as it is (rad)."""
 
 
-def without_whole_turns(omega: Any, rate: float) -> Any:
-    """Return a yaw rate without the whole turns per sample. The heading at the next sample is the same.
+def by_shorter_turn(omega: Any, rate: float) -> Any:
+    """Return the yaw rate that leads to the same heading by less than half a turn per sample.
 
-    A robot that makes a whole turn per sample drives a circle back to where it was, and never arrives.
-    omega (rad/s) of shape (...), sampled at a rate (Hz), is left as it is up to `LARGEST_TURN`: turns
-    from 7/8 to a whole one are nearly as bad.
+    Turns up to `LARGEST_TURN`, 7/8 of a whole one, are left as they are. The path differs, and that is
+    the purpose: a robot that makes about a whole turn per sample drives a circle back to where it was,
+    and never arrives. omega has the shape (...) (rad/s) and is sampled at a rate (Hz).
     """
     return where(abs(omega) <= LARGEST_TURN * rate, omega, wrap(omega / rate) * rate)

@@ -8,8 +8,8 @@ columns, and the rows of E's inverse, are exchanged here.
     w --J_w--> u --S(theta)--> q_dot
 
 `@formula('(),() -> (2,2)', r=positive, L=positive)` says that a function of two numbers, both positive,
-returns a 2x2 matrix, an array. `f.formula(...)` is the same function without checks, of numbers that
-were checked (`numerics.formula`).
+returns a 2x2 matrix, an array. `f.formula(...)` is the body as it is written: without checks, and a
+matrix is a list of rows. So matrices are multiplied by `product`, not by `@` (`numerics.formula`).
 
 Everything broadcasts over leading axes. A radius or separation that is not positive and finite, an
 angle or speed that is not finite, shapes that do not broadcast, and terms or results that overflow raise
@@ -202,9 +202,9 @@ def wheel_centres(pose: Vector, L: Number) -> Rows:
 def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
     """Return the velocities of the centres of both wheels (E).
 
-    Right `v_C + L/2 theta_dot e_f`, left `v_C - L/2 theta_dot e_f`, with `e_f = [cos, sin]`: that is
-    `v_C + omega × r`, with r from the axle centre C to the wheel. Their mean is the velocity of C. Of
-    wheels that roll without slip they are `r omega_R e_f` and `r omega_L e_f`.
+    Right `v_C + L/2 theta_dot e_f`, left `v_C - L/2 theta_dot e_f`, with `e_f = [cos, sin]`: the rule
+    `v_Q = v_P + omega × PQ` from the axle centre C to each wheel. Their mean is the velocity of C. Of
+    wheels that roll without slip they are `r omega_R e_f` and `r omega_L e_f`, r the wheel radius.
 
     For headings theta, shape (...) (rad), velocities `q_dot = [x_dot, y_dot, theta_dot]` in the world,
     shape (..., 3) (m/s, m/s, rad/s), and L, shape (...) (m), the result has the shape (..., 2, 2) (m/s):
@@ -220,7 +220,8 @@ def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
 
 @formula('() -> (1,3)')
 def no_lateral_slip_constraint(theta: Number) -> Rows:
-    """Return the row `a(theta) = [sin, -cos, 0]` with `a q_dot = 0`: no lateral slip (A, E, as A(q)).
+    """Return the row `[sin, -cos, 0]`, times which q_dot is 0: no lateral slip (documents A and E:
+    A(q)).
 
     For headings theta, shape (...) (rad), the result has the shape (..., 1, 3). Its null space is the
     range of S(theta). In the body frame it is `[0, -1, 0]` for every heading.
@@ -233,10 +234,10 @@ def lie_bracket(theta: Number) -> Entries:
     """Return the Lie bracket of the columns of S(theta): `[g_1, g_2] = [sin, -cos, 0]`.
 
     `g_1 = [cos, sin, 0]` drives, `g_2 = [0, 0, 1]` turns, and `[g_1, g_2] = dg_2/dq g_1 - dg_1/dq g_2`.
-    Driving `a` forward, turning by `b`, driving back and turning back moves the robot by `a b [g_1,
-    g_2]` plus terms of third order, as in parallel parking (A, 3.2.2): along the direction that
-    `no_lateral_slip_constraint` forbids. For headings theta, shape (...) (rad), it has the shape
-    (..., 3).
+    Driving a distance s forward, turning by b, driving back and turning back moves the robot by `s b
+    [g_1, g_2]` plus terms of third order, as in parallel parking (A, 3.2.2): along the direction that
+    `no_lateral_slip_constraint` forbids. For headings theta, shape (...) (rad), it has the shape (...,
+    3).
 
     Source: doc/mathematics.md, "Controllability".
     """

@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from unique_identifier_msgs.msg import UUID
 
 from diffdrive_jacobian.control import KP, KV, Arrival, Controller, Path, PathController, Waypoints
-from diffdrive_jacobian.control.goal_laws import LARGEST_TURN, without_whole_turns
+from diffdrive_jacobian.control.goal_laws import LARGEST_TURN, by_shorter_turn
 from diffdrive_jacobian.control.path_following import PathFollower
 from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.messages import conversion as messages
@@ -479,7 +479,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         v, omega = scaled_to_limits.floats(v, omega, *self._limit_values, 1.0, 1.0)
         if abs(omega) > LARGEST_TURN * self._rate:
             # The other direction may be forbidden.
-            omega = without_whole_turns(omega, self._rate)
+            omega = by_shorter_turn(omega, self._rate)
             v, omega = scaled_to_limits.floats(v, omega, *self._limit_values, 1.0, 1.0)
         return v, omega
 

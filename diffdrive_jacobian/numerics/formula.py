@@ -28,9 +28,9 @@ If any argument is a matrix, all arguments are arrays with their entries first, 
         return np.einsum('mn...,n...->m...', J, q_dot)
 
 A bad argument raises a ValueError with its name, a missing one a TypeError, and a result that is
-infinite or undefined a ValueError with the names of all arguments. The body without these checks is
-`formula` of the decorated function, for callers whose numbers are checked. `floats` is the same for
-floats alone, for what runs for every message.
+infinite or undefined a ValueError with the names of all arguments. `f.formula` is the body itself, for
+callers whose numbers are checked: no checks, lists instead of arrays. `f.floats` is a copy of the body
+for floats alone, whose `sin`, `where`, ... are those of `math`, for what runs for every message.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ import inspect
 import operator
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, ParamSpec, Protocol, TypeAlias, TypeVar, cast, overload
 
 import numpy as np
@@ -94,20 +95,23 @@ class _Equation:
     """A body with the shapes and the checks of its arguments."""
 
     def __init__(self, body: Callable[..., Any], signature: str, checks: Mapping[str, Check]) -> None:
-        self.body, self.checks, self.called = body, checks, inspect.signature(body)
+        self.body, self.checks, self.signature = body, checks, inspect.signature(body)
+        if '->' not in signature:
+            raise TypeError(f'signature must be as (3),() -> (2), got {signature!r}')
         inputs, self.outputs = map(_shapes, signature.split('->'))
-        names = [name for name in self.called.parameters if name != 'self']
+        parameters = self.signature.parameters
+        names = [name for name in parameters if name != 'self']
         if len(names) != len(inputs):
             raise TypeError(f'{signature} must have the arguments {", ".join(names)}, got {len(inputs)}')
         self.shapes = dict(zip(names, inputs, strict=True))
         if unknown := checks.keys() - self.shapes.keys():
             raise TypeError(f'checks must be of {", ".join(names)}, got {", ".join(sorted(unknown))}')
         self.of_matrices = any(len(shape) > 1 for shape in inputs)
-        self.optional = {name for name in names if self.called.parameters[name].default is None}
+        self.optional = {name for name in names if parameters[name].default is None}
         self.attributes = {
             size for shape in inputs for size in shape if isinstance(size, str) and len(size) > 1
         }
-        if self.attributes and 'self' not in self.called.parameters:
+        if self.attributes and 'self' not in parameters:
             name = min(self.attributes)
             raise TypeError(f'a size by a name, {name!r}, is for methods, got {body.__name__}')
         *others, last = names
@@ -116,19 +120,23 @@ class _Equation:
     def __call__(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Check the arguments, evaluate the body for one robot or for a batch, and check the results."""
         try:
-            bound = self.called.bind(*args, **kwargs)
+            bound = self.signature.bind(*args, **kwargs)
         except TypeError as error:
             raise TypeError(f'{self.body.__name__}: {error}; it takes {self.names}') from None
         owner = bound.arguments.get('self')
         sizes: dict[Size, int] = {name: getattr(owner, name) for name in self.attributes}
         batch = self._check(bound.arguments, sizes)
         results = self._evaluate(bound, batch)
-        packed = [
-            _packed(result, shape, sizes, batch)
-            for result, shape in zip(
-                results if len(self.outputs) > 1 else [results], self.outputs, strict=True
-            )
-        ]
+        several = results if len(self.outputs) > 1 else [results]
+        try:
+            packed = [
+                _packed(result, shape, sizes, batch)
+                for result, shape in zip(several, self.outputs, strict=True)
+            ]
+        except (TypeError, ValueError) as error:
+            raise TypeError(
+                f'{self.body.__name__} must return what its signature says: {error}'
+            ) from error
         if not all(np.isfinite(one).all() for one in packed):
             raise self._overflow()
         return tuple(packed) if len(self.outputs) > 1 else packed[0]
@@ -163,16 +171,15 @@ class _Equation:
             elif axes:
                 arguments[name] = list(np.moveaxis(array, -1, 0))
         with np.errstate(all='ignore'):
+            # Floats raise where arrays become infinite or NaN, as `math.sin(inf)` and `1.0 / 0.0`, also
+            # in a branch of `where` that is not taken. Then arrays decide.
+            with suppress(ArithmeticError, ValueError):
+                return self.body(*bound.args, **bound.kwargs)
+            for name in given:
+                arguments[name] = np.asarray(arguments[name])
+            # What the body itself refuses, and mistakes in it, are raised again.
             try:
-                try:
-                    return self.body(*bound.args, **bound.kwargs)
-                except (ArithmeticError, ValueError):
-                    # Floats raise where arrays become infinite or NaN, as `math.sin(inf)` and `1.0 /
-                    # 0.0`, also in a branch of `where` that is not taken. So arrays decide. What the
-                    # body itself refuses, and mistakes in it, are raised again.
-                    for name in given:
-                        arguments[name] = np.asarray(arguments[name])
-                    return self.body(*bound.args, **bound.kwargs)
+                return self.body(*bound.args, **bound.kwargs)
             except ArithmeticError:
                 raise self._overflow() from None
 
@@ -213,7 +220,7 @@ def _packed(
     if len(found) != len(wanted) or any(
         isinstance(want, int) and got != want for got, want in zip(found, wanted, strict=True)
     ):
-        raise TypeError(f'the equation must return the shape {wanted}, got {found}')
+        raise TypeError(f'the shape {wanted}, got {found}')
     packed = np.empty((*batch, *found))
     for index in np.ndindex(*found):
         place = (Ellipsis, *index)

@@ -5,7 +5,8 @@ A commanded twist `u = [v, omega]` passes
 1. the delay;
 
 2. the limits of the acceleration, those of diff_drive_controller, but with one time law s(t) from 0 to 1
-   for both speeds, `u(t) = u_0 + (u_1 - u_0) s(t)`, so that the curvature is kept;
+   for both speeds, `u(t) = u_0 + (u_1 - u_0) s(t)`: from rest, to rest and between twists of equal
+   curvature the path is one circle;
 
 3. the largest speed of each motor, which the robot does not know: the curvature is not kept;
 
@@ -108,12 +109,13 @@ class AccelerationLimits(Checked):
         target: Vector,
         wheel_speeds: Callable[[Number, Number], Vector] | None = None,
     ) -> Iterator[tuple[Number, Vector]]:
-        """Yield the parts of the fastest transition to a target on the straight line from u_0 to u_1.
+        """Yield the parts of `u(s) = start + (target - start) s`, s from 0 to 1, as fast as limits
+        allow.
 
-        s is linear in time in each part. A part ends where v changes its sign, at `s = -v_0/dv`, and its
-        limit changes from that of slowing down to that of speeding up; likewise omega. So there are
-        three, of which some may be empty. From (1, 0) to (-1, 2), with v slowing down at 0.2 and
-        speeding up at 1 m/s^2 and omega at 0.5 rad/s^2, they take 5 s, 2 s and nothing.
+        The limits change where v or omega changes its sign. So there are three parts: to the first such
+        s, to the second, and to 1; some may be empty. In each, s is linear in time. From (1, 0) to (-1,
+        2), with v slowing down at 0.2 and speeding up at 1 m/s^2 and omega at 0.5 rad/s^2, they take 5
+        s, 2 s and nothing.
 
         Twists are those of one robot, of floats, or of many, of arrays. `wheel_speeds` maps a twist to
         the wheel speeds (rad/s), linearly; None: the limit of the wheels is left out.
@@ -130,14 +132,14 @@ class AccelerationLimits(Checked):
         for s_end in (minimum(v_zero, omega_zero), maximum(v_zero, omega_zero), 1.0):
             v_end = _speed_at(s_end, v_zero, v_0, v_1)
             omega_end = _speed_at(s_end, omega_zero, omega_0, omega_1)
-            # The time for s from 0 to 1 at the rates of this part; where there is no limit, none. They
-            # depend on the signs of the speeds, which are those in the middle of the part.
-            seconds = maximum(
+            # The time that s would take from 0 to 1 at the rates of this part, which depend on the signs
+            # of the speeds, those in its middle; where there is no limit, none.
+            whole = maximum(
                 abs(dv) / self.v.rate((v + v_end) / 2.0, dv),
                 abs(domega) / self.omega.rate((omega + omega_end) / 2.0, domega),
                 wheels / self.max_wheel_acceleration,
             )
-            duration = seconds * (s_end - s)
+            duration = whole * (s_end - s)
             yield where(duration >= SHORTEST, duration, 0.0), (v_end, omega_end)
             s, v, omega = s_end, v_end, omega_end
 
@@ -249,8 +251,8 @@ class Actuators(Checked):
     def stopping_distance(self, twist: Twist, wheels: Wheels | None = None) -> tuple[float, float]:
         """Return how far a robot with a held twist rolls and turns after zero is commanded (m, rad).
 
-        Without `wheels` the limit of their acceleration is left out. The largest speeds of the motors
-        are left out, too: the twist must be one that they reach.
+        Without `wheels` the limit of their acceleration is left out, so it may be farther. The largest
+        speeds of the motors are left out, too: the twist must be one that they reach.
         """
         wheel_speeds = None if wheels is None else wheels.wheel_speeds
         parts = self.acceleration.transition(twist, STANDSTILL, wheel_speeds)
@@ -261,8 +263,8 @@ class Actuators(Checked):
 
     @property
     def reaction(self) -> float:
-        """Delay and tau: as far as in this time at the old speed a robot rolls on because of both
-        (s).
+        """Delay plus tau (s): on account of both a robot rolls on as far as in this time at its old
+        speed.
         """
         return self.delay / NANOSECONDS + self.lag
 
@@ -297,8 +299,9 @@ class Drive(NamedTuple):
         """Return how the speeds go on from a time (ns) when another target is commanded.
 
         During the delay the old plan goes on, with its ramps and the commands under way. Then the new
-        ramp begins. The motors may differ from those so far: their largest speeds and their lag are the
-        new ones at once, the limits of the acceleration after the delay.
+        ramp begins; what would have acted later is dropped. The motors may differ from those so far:
+        their largest speeds and their lag are the new ones at once, the limits of the acceleration after
+        the delay.
         """
         now = self.demanded.seconds(stamp)
         then = self.demanded.seconds(stamp + actuators.delay)
@@ -362,8 +365,8 @@ def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece
     """
     for piece in pieces:
         v, omega = (
-            Course(a - b * tau, b, 0.0 if _is_close(u, a - b * tau) else u - (a - b * tau), tau)
-            for (a, b, *_), u in zip((piece.v, piece.omega), here, strict=True)
+            _lag_behind(course.a - course.b * tau, course.b, u, tau)
+            for course, u in zip((piece.v, piece.omega), here, strict=True)
         )
         begin = 0.0
         if v.c or omega.c:
@@ -378,6 +381,7 @@ def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece
                 here = line.twist(line.seconds)
 
 
-def _is_close(u: float, asymptote: float) -> bool:
-    """Return whether they differ by rounding errors alone."""
-    return math.isclose(u, asymptote, rel_tol=1e-15, abs_tol=1e-16)
+def _lag_behind(line: float, b: float, u: float, tau: float) -> Course:
+    """Return the course from u to the line, `line + b t`: without a rest that is a rounding error."""
+    rest = 0.0 if math.isclose(u, line, rel_tol=1e-15, abs_tol=1e-16) else u - line
+    return Course(line, b, rest, tau)

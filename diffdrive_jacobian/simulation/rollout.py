@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.controller import Controller
 from diffdrive_jacobian.control.controllers import ControllerError, find_controller
-from diffdrive_jacobian.control.goal_laws import LARGEST_TURN, without_whole_turns
+from diffdrive_jacobian.control.goal_laws import LARGEST_TURN, by_shorter_turn
 from diffdrive_jacobian.control.waypoints import Arrival, distance_to_goal
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
@@ -364,7 +364,7 @@ class Rollout:
         v, omega = self._limited(v, omega)
         if np.abs(omega).max() > LARGEST_TURN * loops.rate:
             # The other direction may be forbidden.
-            v, omega = self._limited(v, without_whole_turns(omega, loops.rate))
+            v, omega = self._limited(v, by_shorter_turn(omega, loops.rate))
         return v, omega
 
     def _evaluate(self, step: int) -> Any:

@@ -15,7 +15,7 @@ from support.lockstep_nodes import Controller, change
 from support.ros_messages import goal
 
 from diffdrive_jacobian.control import find_controller, go_to_pose
-from diffdrive_jacobian.control.goal_laws import without_whole_turns
+from diffdrive_jacobian.control.goal_laws import by_shorter_turn
 from diffdrive_jacobian.simulation import closed_loops
 
 TOO_FAST = 'not below the odometry rate'
@@ -56,14 +56,14 @@ def test_the_slope_is_the_largest_that_the_yaw_rate_has_over_the_heading(name):
         assert stated <= largest + (kv if name == 'go_to_goal' else 0.15 * stated)
 
 
-def test_without_whole_turns_the_next_heading_is_the_same():
+def test_by_shorter_turn_the_next_heading_is_the_same():
     omega, rate = np.random.default_rng(1).uniform(-1000.0, 1000.0, 1000), 50.0
-    found = without_whole_turns(omega, rate)
+    found = by_shorter_turn(omega, rate)
     assert np.abs(np.sin((found - omega) / rate / 2.0)).max() < 1e-12
     assert np.abs(found).max() <= 7.0 / 8.0 * math.tau * rate
     slow = np.abs(omega) < 270.0
     assert np.array_equal(found[slow], omega[slow])
-    assert without_whole_turns(314.0, rate) == pytest.approx(314.0 - math.tau * rate)
+    assert by_shorter_turn(314.0, rate) == pytest.approx(314.0 - math.tau * rate)
 
 
 def test_weights_with_which_it_would_turn_once_per_sample_for_ever_arrive():

@@ -155,6 +155,14 @@ def test_a_check_returns_the_value(check):
     assert check('x', value) is value
 
 
+def test_a_covariance_in_a_batch_is_compared_with_its_own_size():
+    """Skewed by a ten thousandth, beside one that is a million times as large."""
+    skewed = np.eye(3)
+    skewed[0, 1] = 1e-4
+    with pytest.raises(ValueError, match='symmetric and positive semidefinite, got'):
+        checks.semidefinite('P', np.stack([1e6 * np.eye(3), skewed]))
+
+
 # --- Values with arrays
 
 CASES = [(VelocityLimits, 'max_v'), (Arrival, 'offset')]

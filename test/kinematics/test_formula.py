@@ -125,7 +125,7 @@ def test_mistakes_in_a_body_are_not_called_an_overflow():
             refuses(far)
     longer, pair = formula('(n) -> (n)')(lambda x: [*x, 1.0]), formula('() -> (2)')(lambda x: [x])
     for wrong in (short, longer, pair):
-        with pytest.raises(TypeError, match=r'^the equation must return the shape \('):
+        with pytest.raises(TypeError, match=r'must return what its signature says: the shape \('):
             wrong([1.0, 2.0])
 
 
@@ -190,3 +190,15 @@ def test_a_branch_that_is_not_taken_does_no_harm():
 
     assert inverse(0.0) == 0.0
     assert inverse([0.0, 2.0]).tolist() == [0.0, 0.5]
+
+
+def test_a_signature_must_fit_its_body():
+    for signature, words in (
+        ('(),()', r"signature must be as \(3\),\(\) -> \(2\), got '\(\),\(\)'"),
+        ('() -> ()', 'must have the arguments a, b, got 1'),
+    ):
+        with pytest.raises(TypeError, match=words):
+            formula(signature)(lambda a, b: a + b)
+    two = formula('() -> (),()')(lambda a: a)
+    with pytest.raises(TypeError, match='must return what its signature says'):
+        two(1.0)
