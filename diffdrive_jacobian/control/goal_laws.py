@@ -31,15 +31,15 @@ def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Num
     """Compute the twist that drives a unicycle to a position.
 
     `e = wrap(atan2(y_g - y, x_g - x) - theta)`, `omega = Kp e`, `v = Kv d cos(e)`, where d is the
-    distance (rho below). Both gains should be positive; as in document A's script others are not
-    refused. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never grows. With `Kp <
-    Kv` the heading error settles at one of the two e with `sin(2 e)/(2 e) = Kp/Kv`, and the robot
-    spirals in; with `Kp = Kv` it goes to zero like 1/sqrt(t). Exactly on the goal, where the heading
-    towards it is undefined, v and omega are zero.
+    distance to the goal, rho in the other laws. Both gains should be positive; as in document A's script
+    others are not refused. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never
+    grows. With `Kp < Kv` the heading error settles at one of the two e with `sin(2 e)/(2 e) = Kp/Kv`,
+    and the robot spirals in; with `Kp = Kv` it goes to zero like 1/sqrt(t). Exactly on the goal, where
+    the heading towards it is undefined, v and omega are zero.
 
     If commands are held for a sample, 1/rate, the robot arrives if `Kp < 2 rate` and `Kv < rate`. If
-    they also take effect up to one sample late, it arrives if `Kp + Kv < rate`. Recommended: `Kp + Kv <=
-    rate / 2` (doc/mathematics.md, "Sampling").
+    they also take effect up to one sample late, it arrives if `Kp + Kv < rate`, slowly where Kp is far
+    below Kv. Recommended: `Kp + Kv <= rate / 2` (doc/mathematics.md, "Sampling").
 
     Args:
         state: Pose of the robot, shape (..., 3).
@@ -149,8 +149,8 @@ OFFSET_POINT = Controller(
 # --- To a position and a heading
 
 STEEPEST = 2.741
-"""Largest slope of `phi sin(2 alpha)/(2 alpha)` over alpha for |phi| <= pi [-]: it bounds what `Kv h
-phi` adds to `|d omega / d alpha|` in `go_to_pose`."""
+"""Bound of `|phi d/dalpha (sin(2 alpha)/(2 alpha))|` for |phi| <= pi, 0.8724 pi [-]. Times `Kv h` it
+bounds the part of `|d omega / d alpha|` in `go_to_pose` that depends on phi."""
 
 
 @formula('(3),(3),(),(),() -> (),()', Kp=positive, Kv=positive, h=positive)
@@ -171,11 +171,12 @@ def go_to_pose(
     zero. Exactly on the goal's position, where there is no bearing, v and omega are zero, with any
     heading: then `turn_in_place` turns to it.
 
-    Near the goal `rho_dot = -Kv rho`, `alpha_dot = -Kp alpha - Kv h phi` and `phi_dot = Kv alpha`. So
-    alpha and phi oscillate with the frequency `Kv sqrt(h)`, damped by Kp. They converge before rho if
-    both roots of `s^2 + Kp s + Kv^2 h` are left of -Kv: with `Kp > 2 Kv` and `h > Kp/Kv - 1`, which the
-    default h is. A larger h leads to longer paths. If the goal lies behind, the robot backs up while it
-    turns to it and then drives forwards; if it may not back up, it turns first.
+    With alpha small, `rho_dot = -Kv rho`, `alpha_dot = -Kp alpha - Kv h phi` and `phi_dot = Kv alpha`:
+    alpha and phi are an oscillator of the natural frequency `Kv sqrt(h)`, damped by Kp, with the default
+    h critically or more. They converge before rho if both roots of `s^2 + Kp s + Kv^2 h` are left of
+    -Kv: with `Kp > 2 Kv` and `h > Kp/Kv - 1`, which the default h is. A larger h leads to longer paths.
+    If the goal lies behind, the robot backs up while it turns to it and then drives forwards; if it may
+    not back up, it turns first.
 
     With `Kp > 2 Kv`, and commands that are held for a sample, 1/rate, the robot arrives if `K = Kp + Kv
     (1 + 2.741 h) < 2 rate`; if they also take effect up to one sample late, if `K < rate`. Recommended:
@@ -241,10 +242,10 @@ LARGEST_TURN = 7.0 / 8.0 * tau
 
 
 def by_shorter_turn(omega: Any, rate: float) -> Any:
-    """Return the yaw rate that leads to the same heading by less than half a turn per sample.
+    """Return a yaw rate, with turns of more than 7/8 per sample replaced by the shorter one.
 
-    Turns up to `LARGEST_TURN`, 7/8 of a whole one, are left as they are. The path differs, and that is
-    the purpose: a robot that makes about a whole turn per sample drives a circle back to where it was,
-    and never arrives. omega has the shape (...) (rad/s) and is sampled at a rate (Hz).
+    It leads to the same heading at the next sample. The path differs, and that is the purpose: a robot
+    that makes about a whole turn per sample drives a circle back to where it was, and never arrives.
+    omega has the shape (...) (rad/s) and is sampled at a rate (Hz).
     """
     return where(abs(omega) <= LARGEST_TURN * rate, omega, wrap(omega / rate) * rate)

@@ -8,8 +8,10 @@ columns, and the rows of E's inverse, are exchanged here.
     w --J_w--> u --S(theta)--> q_dot
 
 `@formula('(),() -> (2,2)', r=positive, L=positive)` says that a function of two numbers, both positive,
-returns a 2x2 matrix, an array. `f.formula(...)` is the body as it is written: without checks, and a
-matrix is a list of rows. So matrices are multiplied by `product`, not by `@` (`numerics.formula`).
+returns a 2x2 matrix, an array; `d=offset` requires a finite number that is not 0. `f.formula(...)` is
+the body as it is written: without checks, and a matrix is a list of rows. So matrices are multiplied by
+`product`, not by `@` (`numerics.formula`). In docstrings cos and sin are those of theta, A(8) is
+equation (8) of document A, and A's script calls `q_dot` `xi_dot` and `J_w` `J_wheel`.
 
 Everything broadcasts over leading axes. A radius or separation that is not positive and finite, an
 angle or speed that is not finite, shapes that do not broadcast, and terms or results that overflow raise
@@ -88,8 +90,8 @@ def body_to_wheel_jacobian(r: Number, L: Number) -> Rows:
 def wheel_to_world_jacobian(theta: Number, r: Number, L: Number) -> Rows:
     """Map wheel speeds to the velocity in the world: the whole chain `q_dot = S(theta) J_w w` (A, B, E).
 
-    `S J_w = [[r/2 cos, r/2 cos], [r/2 sin, r/2 sin], [r/L, -r/L]]`. For headings theta (rad), r and L
-    (m), each of shape (...), it has the shape (..., 3, 2) and rank 2.
+    `S J_w = [[(r/2) cos, (r/2) cos], [(r/2) sin, (r/2) sin], [r/L, -r/L]]`. For headings theta (rad), r
+    and L (m), each of shape (...), it has the shape (..., 3, 2) and rank 2.
     """
     S = unicycle_jacobian.formula(theta)
     J_w = wheel_to_body_jacobian.formula(r, L)
@@ -144,8 +146,8 @@ def offset_point_jacobian(theta: Number, r: Number, L: Number, d: Number) -> Row
     `J_d = R(theta) [[r/2, r/2], [d r/L, -d r/L]]`. Its determinant is `-d r^2 / L`, so it is invertible
     for every heading if d is not 0; d = 0 raises ValueError.
 
-    For headings theta (rad), r, L and the coordinate x of the point in the body frame, d (m), each of
-    shape (...), the result over `[omega_R, omega_L]` has the shape (..., 2, 2).
+    For headings theta (rad), r, L (m) and d, the x coordinate of the point in the body frame (m), each
+    of shape (...), the result over `[omega_R, omega_L]` has the shape (..., 2, 2).
     """
     R = [
         [cos(theta), -sin(theta)],
@@ -220,8 +222,7 @@ def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
 
 @formula('() -> (1,3)')
 def no_lateral_slip_constraint(theta: Number) -> Rows:
-    """Return the row `[sin, -cos, 0]`, times which q_dot is 0: no lateral slip (documents A and E:
-    A(q)).
+    """Return the row `[sin, -cos, 0]` with `row q_dot = 0`: no lateral slip (documents A and E).
 
     For headings theta, shape (...) (rad), the result has the shape (..., 1, 3). Its null space is the
     range of S(theta). In the body frame it is `[0, -1, 0]` for every heading.

@@ -30,7 +30,7 @@ If any argument is a matrix, all arguments are arrays with their entries first, 
 A bad argument raises a ValueError with its name, a missing one a TypeError, and a result that is
 infinite or undefined a ValueError with the names of all arguments. `f.formula` is the body itself, for
 callers whose numbers are checked: no checks, lists instead of arrays. `f.floats` is a copy of the body
-for floats alone, whose `sin`, `where`, ... are those of `math`, for what runs for every message.
+for floats alone, with the functions of `math`, for what runs for every message.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ def formula(signature: str, **checks: Check) -> _Decorator:
             return equation(args, kwargs)
 
         def floats(*args: Any, **kwargs: Any) -> Any:
-            # Replaces itself when it is called first: the body may call what is defined after it.
+            # At the first call, because the body may call what is defined after it. Then the copy takes
+            # the place of this function, for speed.
             if checked.floats is floats:  # type: ignore[attr-defined]
                 checked.floats = for_floats(body)  # type: ignore[attr-defined]
             return checked.floats(*args, **kwargs)  # type: ignore[attr-defined]
@@ -96,7 +97,7 @@ class _Equation:
 
     def __init__(self, body: Callable[..., Any], signature: str, checks: Mapping[str, Check]) -> None:
         self.body, self.checks, self.signature = body, checks, inspect.signature(body)
-        if '->' not in signature:
+        if signature.count('->') != 1:
             raise TypeError(f'signature must be as (3),() -> (2), got {signature!r}')
         inputs, self.outputs = map(_shapes, signature.split('->'))
         parameters = self.signature.parameters
@@ -104,6 +105,8 @@ class _Equation:
         if len(names) != len(inputs):
             raise TypeError(f'{signature} must have the arguments {", ".join(names)}, got {len(inputs)}')
         self.shapes = dict(zip(names, inputs, strict=True))
+        if not names:
+            raise TypeError(f'{body.__name__} must have arguments, got none')
         if unknown := checks.keys() - self.shapes.keys():
             raise TypeError(f'checks must be of {", ".join(names)}, got {", ".join(sorted(unknown))}')
         self.of_matrices = any(len(shape) > 1 for shape in inputs)
@@ -159,17 +162,21 @@ class _Equation:
         return leading(**leads)
 
     def _evaluate(self, bound: inspect.BoundArguments, batch: tuple[int, ...]) -> Any:
-        """Return what the body returns."""
+        """Call the body: with floats and lists for one robot, with arrays for a batch.
+
+        If floats raise it is called with arrays, which give infinity or NaN instead.
+        """
         arguments = bound.arguments
         given = [name for name in self.shapes if name in arguments]
         for name in given:
             array, axes = arguments[name], len(self.shapes[name])
             if self.of_matrices:
                 arguments[name] = entries_first(array, axes, len(batch))
-            elif not batch:
+            elif not batch:  # one robot: a float, or a list of floats
                 arguments[name] = array.tolist()
-            elif axes:
+            elif axes:  # the vectors of a batch: a list of their entries, which are arrays
                 arguments[name] = list(np.moveaxis(array, -1, 0))
+            # The numbers of a batch are an array already.
         with np.errstate(all='ignore'):
             # Floats raise where arrays become infinite or NaN, as `math.sin(inf)` and `1.0 / 0.0`, also
             # in a branch of `where` that is not taken. Then arrays decide.
@@ -196,14 +203,14 @@ def _shapes(side: str) -> list[tuple[Size, ...]]:
 
 
 def entries_first(array: Array, own_axes: int, batch_axes: int) -> Array:
-    """Move the last axes, its own, to the front, before those of the batch, which are so many."""
+    """Turn (batch, m, n) into (m, n, batch); axes of the batch that are missing get the length 1."""
     padded = array.reshape((1,) * (batch_axes + own_axes - array.ndim) + array.shape)
     order = *range(batch_axes, padded.ndim), *range(batch_axes)
     return np.asarray(padded.transpose(order), order='C')
 
 
 def entries_last(array: Array, own_axes: int) -> Array:
-    """Move the first axes, its own, behind those of the batch."""
+    """Turn (m, n, batch) into (batch, m, n)."""
     return np.asarray(array.transpose(*range(own_axes, array.ndim), *range(own_axes)), order='C')
 
 
@@ -223,6 +230,7 @@ def _packed(
         raise TypeError(f'the shape {wanted}, got {found}')
     packed = np.empty((*batch, *found))
     for index in np.ndindex(*found):
+        # result[i] of a vector, result[i][j] of a matrix
         place = (Ellipsis, *index)
         packed[place] = functools.reduce(operator.getitem, index, result)
     return packed if packed.ndim else float(packed)

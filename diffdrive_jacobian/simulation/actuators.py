@@ -2,7 +2,7 @@
 
 A commanded twist `u = [v, omega]` passes
 
-1. the delay;
+1. the delay, during which what was commanded before goes on;
 
 2. the limits of the acceleration, those of diff_drive_controller, but with one time law s(t) from 0 to 1
    for both speeds, `u(t) = u_0 + (u_1 - u_0) s(t)`: from rest, to rest and between twists of equal
@@ -112,10 +112,10 @@ class AccelerationLimits(Checked):
         """Yield the parts of `u(s) = start + (target - start) s`, s from 0 to 1, as fast as limits
         allow.
 
-        The limits change where v or omega changes its sign. So there are three parts: to the first such
-        s, to the second, and to 1; some may be empty. In each, s is linear in time. From (1, 0) to (-1,
-        2), with v slowing down at 0.2 and speeding up at 1 m/s^2 and omega at 0.5 rad/s^2, they take 5
-        s, 2 s and nothing.
+        s(t) is that of doc/mathematics.md. The limits change where v or omega changes its sign. So there
+        are three parts: to the first such s, to the second, and to 1; some may be empty. In each, s is
+        linear in time. From (1, 0) to (-1, 2), with v slowing down at 0.2 and speeding up at 1 m/s^2 and
+        omega at 0.5 rad/s^2, they take 5 s, 2 s and nothing.
 
         Twists are those of one robot, of floats, or of many, of arrays. `wheel_speeds` maps a twist to
         the wheel speeds (rad/s), linearly; None: the limit of the wheels is left out.
@@ -132,8 +132,8 @@ class AccelerationLimits(Checked):
         for s_end in (minimum(v_zero, omega_zero), maximum(v_zero, omega_zero), 1.0):
             v_end = _speed_at(s_end, v_zero, v_0, v_1)
             omega_end = _speed_at(s_end, omega_zero, omega_0, omega_1)
-            # The time that s would take from 0 to 1 at the rates of this part, which depend on the signs
-            # of the speeds, those in its middle; where there is no limit, none.
+            # Seconds for s from 0 to 1 at the limits of this part: signs are taken in its middle, and
+            # without a limit x / inf = 0.
             whole = maximum(
                 abs(dv) / self.v.rate((v + v_end) / 2.0, dv),
                 abs(domega) / self.omega.rate((omega + omega_end) / 2.0, domega),
@@ -299,15 +299,16 @@ class Drive(NamedTuple):
         """Return how the speeds go on from a time (ns) when another target is commanded.
 
         During the delay the old plan goes on, with its ramps and the commands under way. Then the new
-        ramp begins; what would have acted later is dropped. The motors may differ from those so far:
-        their largest speeds and their lag are the new ones at once, the limits of the acceleration after
-        the delay.
+        ramp begins; what would have acted later is dropped. With a delay of 0.3 s, A commanded at 0 and
+        B at 0.2 s, the ramp to A acts from 0.3 s to 0.5 s, and then that to B. The motors may differ
+        from those so far: their largest speeds and their lag are the new ones at once, the limits of the
+        acceleration after the delay.
         """
         now = self.demanded.seconds(stamp)
-        then = self.demanded.seconds(stamp + actuators.delay)
-        until_then = self.demanded.between(now, then)
-        after = ramp(self.demanded.twist(then), target, actuators.acceleration, wheels)
-        demanded = [*until_then, *after]
+        acts = self.demanded.seconds(stamp + actuators.delay)
+        old_plan = self.demanded.between(now, acts)
+        rise = ramp(self.demanded.twist(acts), target, actuators.acceleration, wheels)
+        demanded = [*old_plan, *rise]
         motion = demanded
         if actuators.weak:
             motion = list(_saturated(demanded, actuators, wheels))
@@ -364,24 +365,24 @@ def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece
     tau)`. After `SETTLING` time constants the exponential function is left out.
     """
     for piece in pieces:
-        v, omega = (
-            _lag_behind(course.a - course.b * tau, course.b, u, tau)
-            for course, u in zip((piece.v, piece.omega), here, strict=True)
-        )
+        v = _lag_behind(piece.v, here[0], tau)
+        omega = _lag_behind(piece.omega, here[1], tau)
         begin = 0.0
         if v.c or omega.c:
             lagging = Piece(min(piece.seconds, SETTLING * tau), v, omega)
             yield lagging
             begin, here = lagging.seconds, lagging.twist(lagging.seconds)
         if begin < piece.seconds:
-            line = Piece(math.inf, Course(v.a, v.b), Course(omega.a, omega.b))
-            line = line.part(begin, piece.seconds)
-            yield line
+            # Then the straight line is left.
+            settled = Piece(math.inf, Course(v.a, v.b), Course(omega.a, omega.b))
+            settled = settled.part(begin, piece.seconds)
+            yield settled
             if piece.seconds < math.inf:
-                here = line.twist(line.seconds)
+                here = settled.twist(settled.seconds)
 
 
-def _lag_behind(line: float, b: float, u: float, tau: float) -> Course:
-    """Return the course from u to the line, `line + b t`: without a rest that is a rounding error."""
-    rest = 0.0 if math.isclose(u, line, rel_tol=1e-15, abs_tol=1e-16) else u - line
-    return Course(line, b, rest, tau)
+def _lag_behind(reached: Course, u: float, tau: float) -> Course:
+    """Return how a speed u follows another one, as above; a c that is a rounding error is left out."""
+    a = reached.a - reached.b * tau
+    c = 0.0 if math.isclose(u, a, rel_tol=1e-15, abs_tol=1e-16) else u - a
+    return Course(a, reached.b, c, tau)

@@ -1,4 +1,4 @@
-"""WheelSpeeds that change with time: in each piece of time v and omega are `a + b t + c exp(-t / tau)`.
+"""Speeds that change with time: in each piece of time v and omega are `a + b t + c exp(-t / tau)`.
 
 That is what acceleration limits and a first-order lag of the wheels make of commands. The last piece is
 constant and has no end. The pose is computed by Gauss-Legendre quadrature in equal steps of each piece,

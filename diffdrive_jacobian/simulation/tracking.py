@@ -261,7 +261,7 @@ def follow_path(
         gains: Values of gains of the law, by name; None: their defaults.
         start: Pose of the robot, shape (3,); None: on the start of the path, along it.
         model: The robot; None: an ideal one.
-        settings: WheelSpeeds and distances; None: their defaults.
+        settings: Speeds and distances; None: their defaults.
         localised: Whether the law is given the true pose, as of a localisation, rather than that of the
             odometry.
         rate: Control rate (Hz).

@@ -79,7 +79,7 @@ def driven(model: RobotModel, name: str, duration: float) -> Robot:
 
 def states(model: RobotModel, name: str, duration: float) -> Iterator[Robot]:
     """Yield the robot after each command of a drive, and at its end."""
-    drive, actuators = LIMITED.get(name, (name, None))
+    drive, actuators = LIMITED.get(name, (name, Actuators()))
     stamp = START
     robot = Robot(model=replace(model, actuators=actuators), stamp=stamp, pose=np.zeros(3))
     for twist, held in DRIVES[drive](duration):

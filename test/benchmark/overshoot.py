@@ -45,7 +45,7 @@ def v_limits(a: float) -> AxisLimits:
 
 PLANNED = AccelerationLimits(v=v_limits(2.5), omega=OMEGA)
 ROBOTS = {
-    'follows at once': None,
+    'follows at once': Actuators(),
     '2.5 m/s², 3.2 rad/s²': Actuators(acceleration=PLANNED),
     'the same, lag 0.1 s, delay 0.1 s': Actuators(acceleration=PLANNED, lag=0.1, delay=100_000_000),
     '0.05 m/s², 3.2 rad/s²': Actuators(acceleration=AccelerationLimits(v=v_limits(0.05), omega=OMEGA)),
