@@ -93,7 +93,11 @@ def formula(signature: str, **checks: Check) -> _Decorator:
 
 
 class _Equation:
-    """A body with the shapes and the checks of its arguments."""
+    """A body, and what its signature says: `shapes` of the arguments, and `outputs` of the results.
+
+    Of `(m,n),(n) -> (m)` they are `{'J': ('m', 'n'), 'q_dot': ('n',)}` and `[('m',)]`. A call learns its
+    `sizes`, such as `{'m': 2, 'n': 3}`, and its `batch`: the axes to which those in front broadcast.
+    """
 
     def __init__(self, body: Callable[..., Any], signature: str, checks: Mapping[str, Check]) -> None:
         self.body, self.checks, self.signature = body, checks, inspect.signature(body)
@@ -102,15 +106,16 @@ class _Equation:
         inputs, self.outputs = map(_shapes, signature.split('->'))
         parameters = self.signature.parameters
         names = [name for name in parameters if name != 'self']
+        if not names:
+            raise TypeError(f'{body.__name__} must have arguments, got none')
         if len(names) != len(inputs):
             raise TypeError(f'{signature} must have the arguments {", ".join(names)}, got {len(inputs)}')
         self.shapes = dict(zip(names, inputs, strict=True))
-        if not names:
-            raise TypeError(f'{body.__name__} must have arguments, got none')
         if unknown := checks.keys() - self.shapes.keys():
             raise TypeError(f'checks must be of {", ".join(names)}, got {", ".join(sorted(unknown))}')
         self.of_matrices = any(len(shape) > 1 for shape in inputs)
         self.optional = {name for name in names if parameters[name].default is None}
+        # The sizes that are attributes of self, as `joints`.
         self.attributes = {
             size for shape in inputs for size in shape if isinstance(size, str) and len(size) > 1
         }
@@ -121,7 +126,7 @@ class _Equation:
         self.names = f'{", ".join(others)} and {last}' if others else last
 
     def __call__(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Check the arguments, evaluate the body for one robot or for a batch, and check the results."""
+        """Bind the arguments to their names, check them, evaluate the body and pack what it returns."""
         try:
             bound = self.signature.bind(*args, **kwargs)
         except TypeError as error:
@@ -130,35 +135,22 @@ class _Equation:
         sizes: dict[Size, int] = {name: getattr(owner, name) for name in self.attributes}
         batch = self._check(bound.arguments, sizes)
         results = self._evaluate(bound, batch)
-        several = results if len(self.outputs) > 1 else [results]
-        try:
-            packed = [
-                _packed(result, shape, sizes, batch)
-                for result, shape in zip(several, self.outputs, strict=True)
-            ]
-        except (TypeError, ValueError) as error:
-            raise TypeError(
-                f'{self.body.__name__} must return what its signature says: {error}'
-            ) from error
-        if not all(np.isfinite(one).all() for one in packed):
-            raise self._overflow()
-        return tuple(packed) if len(self.outputs) > 1 else packed[0]
+        return self._pack(results, sizes, batch)
 
     def _check(self, arguments: dict[str, Any], sizes: dict[Size, int]) -> tuple[int, ...]:
-        """Replace arguments by arrays. Returns the axes to which those in front broadcast."""
+        """Replace arguments by arrays, learn their sizes, and return the axes of the batch."""
         leads: dict[str, tuple[int, ...]] = {}
-        for name in [name for name in self.shapes if name in arguments]:
-            if arguments[name] is None and name in self.optional:
-                del arguments[name]
-                continue
-            shape = self.shapes[name]
-            # The first argument with a letter sets its size, with which later ones must agree.
-            array = shaped(name, arguments[name], *(sizes.get(size, size) for size in shape))
-            self.checks.get(name, finite)(name, array)
-            own = array.ndim - len(shape)
-            leads[name] = array.shape[:own]
-            sizes |= zip(shape, array.shape[own:], strict=True)
-            arguments[name] = array
+        for name, shape in self.shapes.items():
+            if name in self.optional and arguments.get(name) is None:
+                arguments.pop(name, None)
+            elif name in arguments:
+                # The first argument with a letter sets its size, with which later ones must agree.
+                array = shaped(name, arguments[name], *(sizes.get(size, size) for size in shape))
+                self.checks.get(name, finite)(name, array)
+                own = array.ndim - len(shape)
+                leads[name] = array.shape[:own]
+                sizes |= zip(shape, array.shape[own:], strict=True)
+                arguments[name] = array
         return leading(**leads)
 
     def _evaluate(self, bound: inspect.BoundArguments, batch: tuple[int, ...]) -> Any:
@@ -189,6 +181,22 @@ class _Equation:
                 return self.body(*bound.args, **bound.kwargs)
             except ArithmeticError:
                 raise self._overflow() from None
+
+    def _pack(self, results: Any, sizes: Mapping[Size, int], batch: tuple[int, ...]) -> Any:
+        """Return results as arrays of the shapes that the signature says, a number as a float."""
+        several = results if len(self.outputs) > 1 else [results]
+        try:
+            packed = [
+                _packed(result, shape, sizes, batch)
+                for result, shape in zip(several, self.outputs, strict=True)
+            ]
+        except (TypeError, ValueError) as error:
+            raise TypeError(
+                f'{self.body.__name__} must return what its signature says: {error}'
+            ) from error
+        if not all(np.isfinite(one).all() for one in packed):
+            raise self._overflow()
+        return tuple(packed) if len(self.outputs) > 1 else packed[0]
 
     def _overflow(self) -> ValueError:
         return ValueError(f'{self.names} must give a finite result, but it overflows or is undefined')
