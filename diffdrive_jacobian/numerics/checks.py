@@ -178,6 +178,7 @@ def numbers_that(inside: Callable[[Any], Any], allowed: str) -> Check:
             raise ValueError(f'{name} must be {allowed}, got {value}')
         return value
 
+    check.__doc__ = f'Require a number, or each entry of an array, to be {allowed}.'
     return check
 
 

@@ -411,13 +411,13 @@ def public_page() -> str:
     for path, value in public_names().items():
         package, _, name = path.partition('.')
         if not name:
-            lines += ['', f'## {package}', '', _sentence(value), '', '| name | |', '|---|---|']
+            lines += ['', f'## {package}', '', sentence(value), '', '| name | |', '|---|---|']
         else:
-            lines.append(f'| `{name}` | {_sentence(value, path)} |')
+            lines.append(f'| `{name}` | {sentence(value, path)} |')
     return '\n'.join([*lines, ''])
 
 
-def _sentence(value: object, path: str = '') -> str:
+def sentence(value: object, path: str = '') -> str:
     """Return the first sentence of the docstring of a public object, at this path in the package."""
     documented = inspect.ismodule(value) or inspect.isclass(value) or inspect.isroutine(value)
     # Until Python 3.10 the alias of a type is an instance of `type`, too.

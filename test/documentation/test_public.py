@@ -40,6 +40,13 @@ for name in {PACKAGES}:
     subprocess.run([sys.executable, '-c', code], check=True)
 
 
+def test_every_public_name_has_a_docstring():
+    undocumented = [
+        path for path, value in pages.public_names().items() if not pages.sentence(value, path)
+    ]
+    assert undocumented == []
+
+
 def test_a_package_is_public_or_says_that_it_is_internal():
     for name in PACKAGES:
         package = importlib.import_module(f'{PACKAGE}.{name}')
