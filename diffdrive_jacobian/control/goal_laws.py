@@ -31,11 +31,11 @@ def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Num
     """Compute the twist that drives a unicycle to a position.
 
     `e = wrap(atan2(y_g - y, x_g - x) - theta)`, `omega = Kp e`, `v = Kv d cos(e)`, where d is the
-    distance to the goal, rho in the other laws. Both gains should be positive; as in document A's script
-    others are not refused. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never
-    grows. With `Kp < Kv` the heading error settles at one of the two e with `sin(2 e)/(2 e) = Kp/Kv`,
-    and the robot spirals in; with `Kp = Kv` it goes to zero like 1/sqrt(t). Exactly on the goal, where
-    the heading towards it is undefined, v and omega are zero.
+    distance to the goal as in document A, rho in the other laws. Both gains should be positive; as in
+    A's script others are not refused. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance
+    never grows. With `Kp < Kv` the heading error settles at one of the two e with `sin(2 e)/(2 e) =
+    Kp/Kv`, and the robot spirals in; with `Kp = Kv` it goes to zero like 1/sqrt(t). Exactly on the goal,
+    where the heading towards it is undefined, v and omega are zero.
 
     If commands are held for a sample, 1/rate, the robot arrives if `Kp < 2 rate` and `Kv < rate`. If
     they also take effect up to one sample late, it arrives if `Kp + Kv < rate`, slowly where Kp is far
@@ -72,7 +72,7 @@ GO_TO_GOAL = Controller(
     summary="document A's law, to a position",
     advice=_go_to_goal_advice,
     # e_dot = -Kp e + Kv sin(e) cos(e): omega has the slope kp, and driving changes e by at most kv |e|
-    # per second. A command that is late must not outrun both.
+    # per second. With a command that is late the two add up.
     slope=lambda gains: gains.kp + gains.kv,
     boundary=Boundary(ratio=1.0, beyond='with a larger kv the robot spirals in'),
 )
@@ -106,9 +106,9 @@ def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Num
     distance rho of the point from the goal decays as exp(-k t), whatever the heading. The point comes to
     rest on the goal, the axle centre at a distance |d| from it.
 
-    If commands are held for a sample, 1/rate, the point arrives if `k rho < 2 |d| rate` and `k < rate`;
-    if they also take effect up to one sample late, if `k (1 + rho / |d|) < rate`. With a shorter offset
-    the robot turns too far in one sample while the goal is far away.
+    If commands are held for a sample, 1/rate, the point arrives if `k rho < 2 |d| rate` with rho at the
+    start, and `k < rate`; if they also take effect up to one sample late, if `k (1 + rho / |d|) < rate`.
+    With a shorter offset the robot turns too far in one sample while the goal is far away.
 
     Args:
         state: Pose of the robot, shape (..., 3).
@@ -138,10 +138,10 @@ OFFSET_POINT = Controller(
     name='offset_point',
     law=offset_point,
     summary='input-output linearization at an offset point, document B',
-    gains=(KV, OFFSET),
+    gains=(KV, OFFSET),  # k and d of the law
     offset='offset',
     advice=_offset_point_advice,
-    # That at the goal. At the distance rho from it, it is kv (1 + rho / |offset|).
+    # At the goal alone: at the distance rho, which is not known here, it is kv (1 + rho / |offset|).
     slope=lambda gains: gains.kv,
 )
 
@@ -169,7 +169,7 @@ def go_to_pose(
     sin(alpha)/alpha (alpha + h phi)`, in which h weights phi. In continuous time `V = rho^2 + alpha^2 +
     h phi^2` never grows, as `V_dot = -2 Kv rho^2 cos^2(alpha) - 2 Kp alpha^2`, and all three converge to
     zero. Exactly on the goal's position, where there is no bearing, v and omega are zero, with any
-    heading: then `turn_in_place` turns to it.
+    heading: then the node turns by `turn_in_place`.
 
     With alpha small, `rho_dot = -Kv rho`, `alpha_dot = -Kp alpha - Kv h phi` and `phi_dot = Kv alpha`:
     alpha and phi are an oscillator of the natural frequency `Kv sqrt(h)`, damped by Kp, with the default
@@ -238,14 +238,14 @@ GOAL_CONTROLLERS = (GO_TO_GOAL, OFFSET_POINT, POSE)
 # --- Sampling
 
 LARGEST_TURN = 7.0 / 8.0 * tau
-"""Largest turn per sample that is left as it is (rad)."""
+"""Largest turn per sample that is left as it is (rad). Larger ones lead back to about the start."""
 
 
 def by_shorter_turn(omega: Any, rate: float) -> Any:
-    """Return a yaw rate, with turns of more than 7/8 per sample replaced by the shorter one.
+    """Return a yaw rate, with turns of more than 7/8 per sample replaced by the shorter way.
 
-    It leads to the same heading at the next sample. The path differs, and that is the purpose: a robot
-    that makes about a whole turn per sample drives a circle back to where it was, and never arrives.
-    omega has the shape (...) (rad/s) and is sampled at a rate (Hz).
+    For omega, shape (...) (rad/s), and the rate of the samples (Hz). The heading at the next sample is
+    the same. The path differs, and that is the purpose: a robot that makes about a whole turn per sample
+    drives a circle back to where it was, and never arrives.
     """
     return where(abs(omega) <= LARGEST_TURN * rate, omega, wrap(omega / rate) * rate)

@@ -8,10 +8,13 @@ columns, and the rows of E's inverse, are exchanged here.
     w --J_w--> u --S(theta)--> q_dot
 
 `@formula('(),() -> (2,2)', r=positive, L=positive)` says that a function of two numbers, both positive,
-returns a 2x2 matrix, an array; `d=offset` requires a finite number that is not 0. `f.formula(...)` is
-the body as it is written: without checks, and a matrix is a list of rows. So matrices are multiplied by
-`product`, not by `@` (`numerics.formula`). In docstrings cos and sin are those of theta, A(8) is
-equation (8) of document A, and A's script calls `q_dot` `xi_dot` and `J_w` `J_wheel`.
+returns a 2x2 matrix, an array; `(3)` is a vector, and `(),()` behind the arrow a pair of numbers;
+`d=offset` requires a finite number that is not 0. `f.formula(...)` is the body as it is written: without
+checks, and a matrix is a list of rows. So matrices are multiplied by `product`, not by `@`
+(`numerics.formula`).
+
+In docstrings cos and sin are those of theta, A(8) is equation (8) of document A, and A's script calls
+`q_dot` `xi_dot` and `J_w` `J_wheel`.
 
 Everything broadcasts over leading axes. A radius or separation that is not positive and finite, an
 angle or speed that is not finite, shapes that do not broadcast, and terms or results that overflow raise
@@ -133,7 +136,7 @@ def offset_point(pose: Vector, d: Number) -> Entries:
     """Return the point at x = d in the body frame: `[x + d cos, y + d sin]` in the world (B).
 
     For poses, shape (..., 3), and coordinates d of the point in the body frame, negative behind the
-    axle, shape (...) (m), the result has the shape (..., 2) (m).
+    axle, 0 on it, shape (...) (m), the result has the shape (..., 2) (m).
     """
     x, y, theta = pose
     return [x + d * cos(theta), y + d * sin(theta)]
@@ -235,8 +238,8 @@ def lie_bracket(theta: Number) -> Entries:
     """Return the Lie bracket of the columns of S(theta): `[g_1, g_2] = [sin, -cos, 0]`.
 
     `g_1 = [cos, sin, 0]` drives, `g_2 = [0, 0, 1]` turns, and `[g_1, g_2] = dg_2/dq g_1 - dg_1/dq g_2`.
-    Driving a distance s forward, turning by b, driving back and turning back moves the robot by `s b
-    [g_1, g_2]` plus terms of third order, as in parallel parking (A, 3.2.2): along the direction that
+    Driving a distance a forward, turning by b, driving back and turning back moves the robot by `a b
+    [g_1, g_2]` to second order, as in parallel parking (A, 3.2.2): along the direction that
     `no_lateral_slip_constraint` forbids. For headings theta, shape (...) (rad), it has the shape (...,
     3).
 
@@ -266,8 +269,8 @@ def controllability_matrix(theta: Number) -> Rows:
 def rolling_constraints(theta: Number, r: Number, L: Number) -> tuple[Rows, Rows]:
     """Return the constraints of two rolling wheels, a pair with `A_q q_dot = A_w w` (E).
 
-    Rows: no lateral slip, `x_dot sin - y_dot cos = 0`, and pure rolling of the right and of the left
-    wheel, `x_dot cos + y_dot sin ± L/2 theta_dot = r omega_R, r omega_L`. `A_q` is
+    Rows: no lateral slip, `x_dot sin - y_dot cos = 0`, and pure rolling of the right wheel, `x_dot cos +
+    y_dot sin + L/2 theta_dot = r omega_R`, and of the left one, with `-L/2` and omega_L. `A_q` is
     invertible, its determinant is -L, and `A_q^-1 A_w` is the chain `S(theta) J_w`. For headings theta
     (rad), r and L (m), each of shape (...), they have the shapes (..., 3, 3) and (..., 3, 2).
     """

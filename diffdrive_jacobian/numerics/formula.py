@@ -19,7 +19,7 @@ The body is written for one robot: a number is a float, a vector a list of float
 numbers, lists of numbers, or matrices as lists of rows. For a batch the same body is evaluated once,
 with arrays in place of the floats, which broadcast to the shape of the batch. So it uses the functions
 of `numerics.elementary`: `where(x > 0, a, b)` instead of `if x > 0`, and `[2 * a for a in p]` instead of
-`2 * p`, which repeats a list.
+`2 * p`, which repeats a list. A mistake of these kinds may not show before a batch of two.
 
 If any argument is a matrix, all arguments are arrays with their entries first, also for one robot:
 
@@ -30,7 +30,8 @@ If any argument is a matrix, all arguments are arrays with their entries first, 
 A bad argument raises a ValueError with its name, a missing one a TypeError, and a result that is
 infinite or undefined a ValueError with the names of all arguments. `f.formula` is the body itself, for
 callers whose numbers are checked: no checks, lists instead of arrays. `f.floats` is a copy of the body
-for floats alone, with the functions of `math`, for what runs for every message.
+for floats and lists of them, with the functions of `math`, for what runs for every message: it raises an
+ArithmeticError or a ValueError where a branch of `where` is undefined, also if it is not taken.
 """
 
 from __future__ import annotations
@@ -117,7 +118,10 @@ class _Equation:
         self.optional = {name for name in names if parameters[name].default is None}
         # The sizes that are attributes of self, as `joints`.
         self.attributes = {
-            size for shape in inputs for size in shape if isinstance(size, str) and len(size) > 1
+            size
+            for shape in [*inputs, *self.outputs]
+            for size in shape
+            if isinstance(size, str) and len(size) > 1
         }
         if self.attributes and 'self' not in parameters:
             name = min(self.attributes)
@@ -144,9 +148,10 @@ class _Equation:
             if name in self.optional and arguments.get(name) is None:
                 arguments.pop(name, None)
             elif name in arguments:
-                # The first argument with a letter sets its size, with which later ones must agree.
+                # The first argument with a letter sets its size, with which later ones must agree. A
+                # number stands for itself.
                 array = shaped(name, arguments[name], *(sizes.get(size, size) for size in shape))
-                self.checks.get(name, finite)(name, array)
+                self.checks.get(name, finite)(name, array)  # an array is returned as it is
                 own = array.ndim - len(shape)
                 leads[name] = array.shape[:own]
                 sizes |= zip(shape, array.shape[own:], strict=True)
@@ -156,7 +161,10 @@ class _Equation:
     def _evaluate(self, bound: inspect.BoundArguments, batch: tuple[int, ...]) -> Any:
         """Call the body: with floats and lists for one robot, with arrays for a batch.
 
-        If floats raise it is called with arrays, which give infinity or NaN instead.
+        If that raises a ValueError or an ArithmeticError it is called again, with arrays, also of the
+        entries of vectors: where floats raise, as at `math.sin(inf)` and `1.0 / 0.0`, also in a branch
+        of `where` that is not taken, they give infinity or NaN. What the body itself refuses is raised
+        again.
         """
         arguments = bound.arguments
         given = [name for name in self.shapes if name in arguments]
@@ -170,13 +178,10 @@ class _Equation:
                 arguments[name] = list(np.moveaxis(array, -1, 0))
             # The numbers of a batch are an array already.
         with np.errstate(all='ignore'):
-            # Floats raise where arrays become infinite or NaN, as `math.sin(inf)` and `1.0 / 0.0`, also
-            # in a branch of `where` that is not taken. Then arrays decide.
             with suppress(ArithmeticError, ValueError):
                 return self.body(*bound.args, **bound.kwargs)
             for name in given:
                 arguments[name] = np.asarray(arguments[name])
-            # What the body itself refuses, and mistakes in it, are raised again.
             try:
                 return self.body(*bound.args, **bound.kwargs)
             except ArithmeticError:

@@ -126,7 +126,7 @@ class AccelerationLimits(Checked):
         """
         (v_0, omega_0), (v_1, omega_1) = start, target
         dv, domega = v_1 - v_0, omega_1 - omega_0
-        wheels = maximum(*map(abs, wheel_speeds(dv, domega))) if wheel_speeds else 0.0
+        wheel_change = maximum(*map(abs, wheel_speeds(dv, domega))) if wheel_speeds else 0.0
         v_zero, omega_zero = _zero(v_0, dv), _zero(omega_0, domega)
         s, (v, omega) = 0.0, start
         for s_end in (minimum(v_zero, omega_zero), maximum(v_zero, omega_zero), 1.0):
@@ -134,18 +134,18 @@ class AccelerationLimits(Checked):
             omega_end = _speed_at(s_end, omega_zero, omega_0, omega_1)
             # Seconds for s from 0 to 1 at the limits of this part: signs are taken in its middle, and
             # without a limit x / inf = 0.
-            whole = maximum(
+            full_time = maximum(
                 abs(dv) / self.v.rate((v + v_end) / 2.0, dv),
                 abs(domega) / self.omega.rate((omega + omega_end) / 2.0, domega),
-                wheels / self.max_wheel_acceleration,
+                wheel_change / self.max_wheel_acceleration,
             )
-            duration = whole * (s_end - s)
+            duration = full_time * (s_end - s)
             yield where(duration >= SHORTEST, duration, 0.0), (v_end, omega_end)
             s, v, omega = s_end, v_end, omega_end
 
 
 def _zero(speed: Number, change: Number) -> Number:
-    """Return the s at which a speed is zero; 1.0: its sign does not change."""
+    """Return the s at which a speed changes its sign; 1.0, the end, if it does not."""
     end = speed + change
     crosses = (minimum(speed, end) < 0.0) & (maximum(speed, end) > 0.0)
     return where(crosses, -speed / where(crosses, change, 1.0), 1.0)
@@ -242,7 +242,7 @@ class Actuators(Checked):
     def limited(self, speeds: WheelSpeeds) -> WheelSpeeds:
         """Return the speeds that the motors can reach."""
         (right, left), most_right, most_left = speeds, self.max_right_speed, self.max_left_speed
-        # Of a dead motor not -0.0.
+        # `+ 0.0` makes 0.0 of the -0.0 of a motor that does not turn.
         return (
             max(-most_right, min(most_right, right)) + 0.0,
             max(-most_left, min(most_left, left)) + 0.0,
@@ -251,21 +251,19 @@ class Actuators(Checked):
     def stopping_distance(self, twist: Twist, wheels: Wheels | None = None) -> tuple[float, float]:
         """Return how far a robot with a held twist rolls and turns after zero is commanded (m, rad).
 
-        Without `wheels` the limit of their acceleration is left out, so it may be farther. The largest
-        speeds of the motors are left out, too: the twist must be one that they reach.
+        Without `wheels` the limit of their acceleration is left out, so the robot may roll farther. The
+        largest speeds of the motors are left out, too: the twist must be one that they reach.
         """
         wheel_speeds = None if wheels is None else wheels.wheel_speeds
         parts = self.acceleration.transition(twist, STANDSTILL, wheel_speeds)
-        # No speed changes its sign, so both fall linearly: their mean is half.
+        # To zero no speed changes its sign, so both fall linearly: their mean is half.
         seconds = self.reaction + sum(duration for duration, _ in parts) / 2.0
         v, omega = twist
         return v * seconds, omega * seconds
 
     @property
     def reaction(self) -> float:
-        """Delay plus tau (s): on account of both a robot rolls on as far as in this time at its old
-        speed.
-        """
+        """Delay plus lag (s): a robot that stops rolls on as far as it moved in this time before."""
         return self.delay / NANOSECONDS + self.lag
 
     def reached(self, twist: Twist, wheels: Wheels) -> Twist:
@@ -313,8 +311,8 @@ class Drive(NamedTuple):
         if actuators.weak:
             motion = list(_saturated(demanded, actuators, wheels))
         if actuators.lag:
-            here = self.motion.twist(self.motion.seconds(stamp))
-            motion = list(_lagging(here, motion, actuators.lag))
+            start = self.motion.twist(self.motion.seconds(stamp))
+            motion = list(_lagging(start, motion, actuators.lag))
         return Drive(Profile(stamp, demanded), Profile(stamp, motion))
 
 
@@ -339,50 +337,54 @@ def _line(start: Twist, end: Twist, seconds: float) -> Piece:
 
 
 def _saturated(pieces: Iterable[Piece], actuators: Actuators, wheels: Wheels) -> Iterator[Piece]:
-    """Return what the motors reach of speeds that are linear in each piece."""
-    most = actuators.max_right_speed, actuators.max_left_speed
+    """Return what the motors reach of speeds that are linear in each piece.
+
+    Between the times at which a wheel reaches its limit each wheel is linear or at its limit, so v and
+    omega are linear.
+    """
+    limits = actuators.max_right_speed, actuators.max_left_speed
     for piece in pieces:
         if piece.seconds == math.inf:
             yield held(actuators.reached(piece.twist(0.0), wheels))
             continue
-        ends = wheels.wheel_speeds(*piece.twist(0.0)), wheels.wheel_speeds(*piece.twist(piece.seconds))
-        # Where a wheel reaches its limit.
+        starts = wheels.wheel_speeds(*piece.twist(0.0))
+        ends = wheels.wheel_speeds(*piece.twist(piece.seconds))
         knots = {0.0, piece.seconds}
-        for first, last, bound in zip(*ends, most, strict=True):
-            for limit in (-bound, bound):
-                if min(first, last) < limit < max(first, last):
-                    knots.add(piece.seconds * (limit - first) / (last - first))
+        for start, end, limit in zip(starts, ends, limits, strict=True):
+            for bound in (-limit, limit):
+                if min(start, end) < bound < max(start, end):
+                    knots.add(piece.seconds * (bound - start) / (end - start))
         times = sorted(knots)
         twists = [actuators.reached(piece.twist(time), wheels) for time in times]
         for index in range(len(times) - 1):
             yield _line(twists[index], twists[index + 1], times[index + 1] - times[index])
 
 
-def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece]:
-    """Return how speeds that are `here` follow others, which are `a + b t` in each piece.
+def _lagging(start: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece]:
+    """Return how speeds that begin at `start` lag behind others, which are `a + b t` in each piece.
 
     The solution of `tau du/dt = a + b t - u` is `(a - b tau) + b t + (u(0) - (a - b tau)) exp(-t /
     tau)`. After `SETTLING` time constants the exponential function is left out.
     """
     for piece in pieces:
-        v = _lag_behind(piece.v, here[0], tau)
-        omega = _lag_behind(piece.omega, here[1], tau)
+        v = _lag_behind(piece.v, start[0], tau)
+        omega = _lag_behind(piece.omega, start[1], tau)
         begin = 0.0
         if v.c or omega.c:
-            lagging = Piece(min(piece.seconds, SETTLING * tau), v, omega)
-            yield lagging
-            begin, here = lagging.seconds, lagging.twist(lagging.seconds)
+            transient = Piece(min(piece.seconds, SETTLING * tau), v, omega)
+            yield transient
+            begin, start = transient.seconds, transient.twist(transient.seconds)
         if begin < piece.seconds:
             # Then the straight line is left.
             settled = Piece(math.inf, Course(v.a, v.b), Course(omega.a, omega.b))
             settled = settled.part(begin, piece.seconds)
             yield settled
             if piece.seconds < math.inf:
-                here = settled.twist(settled.seconds)
+                start = settled.twist(settled.seconds)
 
 
-def _lag_behind(reached: Course, u: float, tau: float) -> Course:
+def _lag_behind(target: Course, u: float, tau: float) -> Course:
     """Return how a speed u follows another one, as above; a c that is a rounding error is left out."""
-    a = reached.a - reached.b * tau
+    a = target.a - target.b * tau
     c = 0.0 if math.isclose(u, a, rel_tol=1e-15, abs_tol=1e-16) else u - a
-    return Course(a, reached.b, c, tau)
+    return Course(a, target.b, c, tau)

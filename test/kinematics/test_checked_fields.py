@@ -227,6 +227,6 @@ class Scalar:
 def test_numbers_of_other_libraries_are_numbers_and_durations_are_none():
     assert Slotted(y=Scalar()).y == Slotted(y=np.array(0.5)).y == 0.5
     assert RobotModel(command_timeout=np.array(5)).command_timeout == 5
-    for bad in (np.timedelta64(3), np.array(True), np.array('1')):
+    for bad in (np.timedelta64(3, 'ns'), np.array(True), np.array('1')):
         with pytest.raises(ValueError, match='y must be a number'):
             Slotted(y=bad)

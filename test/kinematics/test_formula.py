@@ -150,6 +150,15 @@ class Chain:
     def turned(self, q, angle):
         return [q_i + angle for q_i in q]
 
+    @formula('() -> (joints)')
+    def two_joints(self, angle):
+        return [angle, angle]
+
+
+def test_a_size_by_a_name_holds_for_results_too():
+    with pytest.raises(TypeError, match=r'what its signature says: the shape \(3,\), got \(2,\)'):
+        Chain().two_joints(1.0)
+
 
 def test_a_method_may_be_an_equation():
     chain = Chain()
