@@ -449,7 +449,7 @@ class Search(Checked):
 
     task: Task
     method: Annotated[str, one_of(*METHODS)]
-    joints: int
+    joints: Count
     tolerance: Positive
     max_iterations: Count
     step_tolerance: NotNegative

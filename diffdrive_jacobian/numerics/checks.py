@@ -21,7 +21,6 @@ import math
 import operator
 import sys
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from functools import cache, partial
 from numbers import Integral, Real
 from types import NoneType, UnionType
@@ -396,8 +395,8 @@ class Checked:
     """Base class of frozen dataclasses whose annotations declare checks.
 
     A field of the type `Annotated[..., check]` has that check. One of type bool, str or of a dataclass
-    must be of it, and `| None` also allows None. Other fields have none, nor have those whose type names
-    what only type checkers import.
+    must be of it, and `| None` also allows None. Other fields have none. Types are names of the module
+    of the class, not only for type checkers: they are evaluated when the first object is made.
 
     In a dataclass with slots a `__post_init__` calls `Checked.__post_init__(self)`, because `super()`
     does not work there.
@@ -420,11 +419,15 @@ def _declared(kind: type) -> dict[str, Check]:
     for base in reversed(kind.__mro__):
         for name, annotation in inspect.get_annotations(base).items():
             declared.pop(name, None)
-            with suppress(NameError):
-                if isinstance(annotation, str):
+            if isinstance(annotation, str):
+                try:
                     annotation = eval(annotation, vars(sys.modules[base.__module__]))
-                if name in given and (check := _check_of(annotation)):
-                    declared[name] = check
+                except NameError as error:
+                    raise TypeError(
+                        f'{base.__name__}.{name} must have a type of its module: {error}'
+                    ) from None
+            if name in given and (check := _check_of(annotation)):
+                declared[name] = check
     return declared
 
 

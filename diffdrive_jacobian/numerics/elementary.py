@@ -99,12 +99,12 @@ def ceil(x: Any) -> Any:
 
 
 def maximum(*values: Any) -> Any:
-    """The largest one."""
+    """The largest one. Of floats NaN counts if it is the first, of arrays always."""
     return max(values) if _are_floats(values) else functools.reduce(np.maximum, values)
 
 
 def minimum(*values: Any) -> Any:
-    """The smallest one."""
+    """The smallest one. Of floats NaN counts if it is the first, of arrays always."""
     return min(values) if _are_floats(values) else functools.reduce(np.minimum, values)
 
 

@@ -70,7 +70,8 @@ def formula(signature: str, **checks: Check) -> _Decorator:
 
     Args:
         signature: Shapes of the arguments and the results, such as `(3),() -> (),()`.
-        checks: What is required of an argument, by its name; of others, that they are finite.
+        checks: What is required of an argument, by its name, a check of arrays such as `positive`; of
+            others, that they are finite.
     """
 
     def decorate(body: Callable[..., Any]) -> Any:
@@ -148,13 +149,14 @@ class _Equation:
             if name in self.optional and arguments.get(name) is None:
                 arguments.pop(name, None)
             elif name in arguments:
-                # The first argument with a letter sets its size, with which later ones must agree. A
-                # number stands for itself.
+                # A number stands for itself. A letter stands for the first size that it is given.
                 array = shaped(name, arguments[name], *(sizes.get(size, size) for size in shape))
                 self.checks.get(name, finite)(name, array)  # an array is returned as it is
                 own = array.ndim - len(shape)
                 leads[name] = array.shape[:own]
-                sizes |= zip(shape, array.shape[own:], strict=True)
+                for size, length in zip(shape, array.shape[own:], strict=True):
+                    if sizes.setdefault(size, length) != length:
+                        raise ValueError(f'{name} must have as many rows as columns, got {array.shape}')
                 arguments[name] = array
         return leading(**leads)
 

@@ -34,8 +34,8 @@ _, QUADRATURE = QUADRATURES[-1]
 class Follower:
     """The twists of some robots, and the commands that they have yet to follow."""
 
-    def __init__(self, actuators: Actuators, count: int, rate: float) -> None:
-        """Start at rest."""
+    def __init__(self, actuators: Actuators, count: int, rate: float, samples: int) -> None:
+        """Start at rest. There is a command at each of so many samples."""
         self.acceleration, self.lag = actuators.acceleration, actuators.lag
         delay = actuators.delay / NANOSECONDS * rate
         periods = int(delay + ROUNDING)
@@ -43,20 +43,23 @@ class Follower:
         # How long the oldest command still counts after a sample, and how long the next one (s).
         self.shares = late / rate, (1.0 - late) / rate
         rest: Array = np.zeros((2, count))
-        self.targets: deque[Array] = deque([rest] * (periods + 1))
+        # What would act after the last sample need not be kept apart.
+        self.targets: deque[Array] = deque([rest] * (min(periods, samples) + 1))
+        # Samples since each robot was last commanded to move.
+        self.idle = np.full(count, len(self.targets))
         # Without a lag they are the same.
         self.demanded = self.twist = rest
 
     def at_rest(self) -> Mask:
         """Return which robots rest and have nothing to follow, shape (n,)."""
         moving: Mask = np.abs(self.twist).max(axis=0) > AT_REST
-        for twist in (self.demanded, *self.targets):
-            moving |= twist.any(axis=0)
+        moving |= self.demanded.any(axis=0) | (self.idle < len(self.targets))
         return np.logical_not(moving)
 
     def shrink(self, going: Rows) -> None:
         """Remove the robots that are finished."""
         self.targets = deque(target[:, going] for target in self.targets)
+        self.idle = self.idle[going]
         self.demanded, self.twist = self.demanded[:, going], self.twist[:, going]
 
     def advance(
@@ -69,6 +72,7 @@ class Follower:
             `[dx, dy, dtheta]`, shape (3, k), and the integrals of |v|, v^2 and omega^2, shape (3, k).
         """
         self.targets.append(command)
+        self.idle = np.where(command.any(axis=0), 0, self.idle + 1)
         late, rest = self.shares
         if late:
             yield from self._follow(wheel_speeds, late)

@@ -78,7 +78,8 @@ def closed_loops(
         r: Wheel radius, shape (...) (m).
         L: Wheel separation, shape (...) (m).
         actuators: How all robots follow commands: limits of the acceleration, lag and delay. A robot
-            that has arrived then rolls on until it is at rest. By default they follow at once.
+            that has arrived then rolls on until it is at rest or the duration ends. By default they
+            follow at once.
         progress: Called from time to time with the number of robots that are finished.
         on_step: Called with that number at every step of every block of robots. An exception that it
             raises ends the batch and is passed on.

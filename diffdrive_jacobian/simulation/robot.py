@@ -115,6 +115,8 @@ class Robot:
         commanded, applied = pair('command', command), pair('twist', twist)
         if commanded_at is not None:
             commanded_at = nanoseconds('commanded_at', commanded_at)
+            if commanded_at > stamp:
+                raise ValueError(f'commanded_at must be at most the stamp, {stamp}, got {commanded_at}')
         state = State(place, angles, moments, _truth(model, place))
         self._start(model, stamp, state, commanded, applied, commanded_at)
 
@@ -345,7 +347,9 @@ class Robot:
         return here._with(here._stamp, state)
 
     def reported(self, pose: Pose, wheel_angles: WheelSpeeds, twist: Twist) -> Robot:
-        """Return this robot as its sensors report it, with the same covariance and the same truth.
+        """Return this robot as its sensors report it, with its covariance and its true pose.
+
+        It is for one message: its twist is the reported one, also as `true_twist`, and is held.
 
         Raises:
             ValueError: An argument has another shape or is not finite.

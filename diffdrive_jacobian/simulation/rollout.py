@@ -53,7 +53,7 @@ class Outcomes(NamedTuple):
         path_length: Length of the path of the axle centre, forwards and backwards (m).
         control_cost: Integral of the squares of both wheel speeds over time (rad^2/s).
         overshoot: Largest distance beyond the goal, along the line from start to goal (m).
-        pose: Last pose, at rest if it arrived, shape (..., 3).
+        pose: Last pose, shape (..., 3): at rest if it arrived, or where the duration ended before that.
     """
 
     arrived: Mask
@@ -269,7 +269,7 @@ class Rollout:
         self.robots = Robots.at_starts(rows, self.columns, loops.law.state)
         self.follower: Follower | None = None
         if not loops.actuators.immediate:
-            self.follower = Follower(loops.actuators, len(rows), loops.rate)
+            self.follower = Follower(loops.actuators, len(rows), loops.rate, loops.steps)
 
     def drive(
         self, keep: Keep | None, on_step: Callable[[], object] | None = None

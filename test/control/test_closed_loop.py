@@ -352,3 +352,13 @@ def test_robots_that_take_time_drive_as_one_of_the_nodes_alone(name):
         expected = math.nan if arrived is None else arrived
         assert gone.outcomes.time[index] == pytest.approx(expected, nan_ok=True)
     assert gone.outcomes.arrived.any()
+
+
+def test_a_command_that_acts_after_the_duration_does_not_move_the_robot():
+    actuators = Actuators(delay=1_000_000 * 1000 * MS)
+    outcome = closed_loops('go_to_goal', [0.0, 0.0, 0.0], [1.0, 0.0], duration=2.0, actuators=actuators)
+    assert outcome.pose.tolist() == [0.0, 0.0, 0.0]
+    # Two samples before the end the first command acts, with a speed of `kv` (0.5) times 1 m.
+    late = Actuators(delay=1960 * MS)
+    outcome = closed_loops('go_to_goal', [0.0, 0.0, 0.0], [1.0, 0.0], duration=2.0, actuators=late)
+    assert_allclose(outcome.pose, [0.02, 0.0, 0.0], atol=1e-12)

@@ -103,17 +103,14 @@ def test_a_dataclass_with_slots_has_no_dictionary_and_can_be_pickled():
         Slotted(y=float('inf'))
 
 
-def test_a_name_for_type_checkers_declares_no_check():
-    """As of a class in a function, or of an import under TYPE_CHECKING."""
-
+def test_a_misspelt_type_is_a_mistake():
     @dataclass(frozen=True)
-    class Local(Checked):
+    class Misspelt(Checked):
         topic: Name
-        world: Missing  # noqa: F821
+        speed: Positve  # noqa: F821
 
-    assert Local('odom', 3).world == 3
-    with pytest.raises(ValueError, match='topic must be a string'):
-        Local('', 3)
+    with pytest.raises(TypeError, match=r'^Misspelt\.speed must have a type of its module: .*Positve'):
+        Misspelt('odom', -1.0)
 
 
 @pytest.mark.parametrize(

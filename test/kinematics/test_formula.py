@@ -155,6 +155,17 @@ class Chain:
         return [angle, angle]
 
 
+def test_a_letter_is_one_size_within_an_argument_too():
+    @formula('(m,m) -> (m)')
+    def diagonal(A):
+        return [A[i][i] for i in range(len(A))]
+
+    assert diagonal([[1.0, 2.0], [3.0, 4.0]]).tolist() == [1.0, 4.0]
+    for shape in (2, 3), (3, 2):
+        with pytest.raises(ValueError, match=r'^A must have as many rows as columns, got \('):
+            diagonal(np.zeros(shape))
+
+
 def test_a_size_by_a_name_holds_for_results_too():
     with pytest.raises(TypeError, match=r'what its signature says: the shape \(3,\), got \(2,\)'):
         Chain().two_joints(1.0)

@@ -176,6 +176,8 @@ def test_a_new_command_restarts_the_timeout_and_standing_still_needs_none():
     assert robot.commanded((0.0, 0.0), 300_000_000).expiry is None
     assert start(HELD).commanded((0.2, 0.0), 0).expiry is None
     assert (start().commanded_at, start().expiry) == (None, None)
+    with pytest.raises(ValueError, match='commanded_at must be at most the stamp, 3, got 4'):
+        Robot(model=MODEL, pose=np.zeros(3), stamp=3, commanded_at=4)
 
 
 # --- Other models, other places
