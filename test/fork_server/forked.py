@@ -12,6 +12,7 @@ from __future__ import annotations
 import atexit
 import builtins
 import ctypes
+import fcntl
 import gc
 import importlib
 import inspect
@@ -50,7 +51,7 @@ SETS = (EVERYTHING, LIBRARIES, ())
 LARGEST = 1 << 20
 """Size of the largest request (bytes)."""
 RESERVED = 100
-"""Number of descriptors, from 0, that children can inherit."""
+"""Number of descriptors, from 0, that the libraries of a server do not get."""
 SERVER = """
 import sys
 sys.path.append(sys.argv[1])
@@ -68,7 +69,7 @@ def serve(descriptor: int, listening: int, modules: list[str]) -> None:
 
     `descriptor` is the connection to that, `listening` the socket to which all others connect.
     """
-    # Children get descriptors of these numbers. Libraries must not have them.
+    # Children get descriptors of these numbers, as a rule. Libraries must not have them.
     for _ in range(RESERVED):
         os.open(os.devnull, os.O_RDONLY)
     # Ctrl-C ends the tests, which close the socket.
@@ -116,9 +117,13 @@ def serve(descriptor: int, listening: int, modules: list[str]) -> None:
                 for each in (listener, *children):
                     each.close()
                 numbers, *program = request
-                assert not numbers or max(numbers) < RESERVED <= min(received)
+                # First out of the way: a number of one may be that which another is to have.
+                above = max([RESERVED, *(number + 1 for number in numbers)])
+                sources = [fcntl.fcntl(each, fcntl.F_DUPFD_CLOEXEC, above) for each in received]
+                for each in received:
+                    os.close(each)
                 os.closerange(0, RESERVED)
-                for number, source in zip(numbers, received, strict=True):
+                for number, source in zip(numbers, sources, strict=True):
                     os.dup2(source, number)
                     os.close(source)
                 _run(*program)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import marshal
 import os
 import signal
@@ -186,12 +187,16 @@ def test_a_command_starts_python_in_a_fork(commands):
     assert results(ended) == (0, 'True\n', '')
 
 
-def test_a_command_inherits_descriptors(commands):
+@pytest.mark.parametrize('least', [0, 100, 101, 102, 103, 300])
+def test_a_command_inherits_descriptors(commands, least):
+    """Also of numbers that the server itself uses, as from a process with many open files."""
     read, write = os.pipe()
     with open(read) as stream:
-        code = 'import os, sys; os.write(int(sys.argv[1]), b"from the child")'
-        subprocess.run([commands / 'python', '-c', code, str(write)], pass_fds=[write], check=True)
+        passed = fcntl.fcntl(write, fcntl.F_DUPFD, least)
         os.close(write)
+        code = 'import os, sys; os.write(int(sys.argv[1]), b"from the child")'
+        subprocess.run([commands / 'python', '-c', code, str(passed)], pass_fds=[passed], check=True)
+        os.close(passed)
         assert stream.read() == 'from the child'
 
 
