@@ -35,13 +35,13 @@ from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError
 from diffdrive_jacobian.messages.codecs import Changes, FaultEvent
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import base_name, namespace_of
-from diffdrive_jacobian.messages.topics import READABLE, TOPICS, Topic
+from diffdrive_jacobian.messages.topics import READABLE, TABLES, Topic
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_NUMBER = 1e6
 """Largest magnitude of the numeric parameters of our nodes (m, m/s, rad/s)."""
-COLUMNS = {topic.series: topic.columns for topic in TOPICS.values() if topic.series}
+COLUMNS = {table.series: table.columns for table in TABLES}
 """Columns of the values of each series of a `Run`."""
 _CONTROLLER = {'controller', 'use_goal_heading', 'xy_goal_tolerance'}
 """Parameters by which a go_to_goal of another name is known."""
@@ -241,9 +241,10 @@ def read_run(
                         event_stamps.append(value.stamp)
                 elif isinstance(value, FaultEvent):
                     fault_events.append((received, value.fault, value.what))
-                else:
-                    rows[topic.series] += [
-                        (received, stamp or received, row) for stamp, row in topic.rows(value, names)
+                elif topic.table is not None:
+                    rows[topic.table.series] += [
+                        (received, stamp or received, row)
+                        for stamp, row in topic.table.rows(value, names)
                     ]
             except LongMessageError:
                 tally.refused[connection.topic] += 1
@@ -254,18 +255,16 @@ def read_run(
                 tally.refused[connection.topic] += 1
         notes = tally.notes(connections)
     series, covariances = {}, {}
-    for topic in TOPICS.values():
-        if topic.series in series or not topic.series:
-            continue
-        found, count = rows[topic.series], len(topic.columns)
+    for table in TABLES:
+        found, count = rows[table.series], len(table.columns)
         values = np.array([row for *_, row in found], dtype=np.float64)
-        values = values.reshape(len(found), count + len(topic.covariances))
-        covariances[topic.series] = values[:, count:].copy()
-        series[topic.series] = Series(
+        values = values.reshape(len(found), count + len(table.covariances))
+        covariances[table.series] = values[:, count:].copy()
+        series[table.series] = Series(
             received=np.array([received for received, *_ in found], dtype=np.int64),
             stamps=np.array([stamp for _, stamp, _ in found], dtype=np.int64),
             values=values[:, :count].copy(),
-            columns=topic.columns,
+            columns=table.columns,
         )
     return Run(
         path=path,

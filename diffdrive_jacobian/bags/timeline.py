@@ -19,7 +19,6 @@ from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import Fate, FollowedGoal, GoalFollower, GoalState, Stamp
-from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -417,8 +416,6 @@ BUCKETS = 1500
 """A longer line is reduced to the minimum and the maximum of so many parts."""
 _TWIST = {'v': 0, 'omega': 1}
 _WHEEL = {'right': 0, 'left': 1}
-_READINGS = {column: topic for topic in SENSORS for column in topic.columns}
-"""Quantities of sensors, and their topics."""
 _BODY = ('virtual_robot', 'go_to_goal')
 _LIMITS = {
     'v': (_BODY, 'linear.x.max_velocity', 'linear.x.min_velocity'),
@@ -431,11 +428,6 @@ _LIMITS = {
 def measured(one: Timeline, quantity: str) -> Array:
     """Return the measured values of a quantity, shape (m, 2); m may be 0."""
     run = one.run
-    if quantity in _READINGS:
-        topic = _READINGS[quantity]
-        series = getattr(run, topic.series)
-        values = series.values[:, topic.columns.index(quantity)]
-        return _continued(one, np.column_stack([seconds(run, series), values]))
     if quantity in _WHEEL:
         values = np.column_stack([seconds(run, run.wheels), run.wheels.values[:, _WHEEL[quantity]]])
         return line(values, _back_in_time(values))

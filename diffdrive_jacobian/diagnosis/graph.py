@@ -8,17 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from diffdrive_jacobian.messages.names import base_name
-from diffdrive_jacobian.messages.topics import (
+from diffdrive_jacobian.messages.topic_faults import (
     ALTERNATING,
-    CLOCK,
-    OF_EVERY_NODE,
     OF_SOMEBODY_ELSE,
     SEVERAL,
-    TOPICS,
     UNPUBLISHED,
     UNREAD,
-    Topic,
 )
+from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TOPICS, Topic
 from diffdrive_jacobian.parameters.wheels import SAME_WHEELS, different_wheels
 from diffdrive_jacobian.text import listed
 

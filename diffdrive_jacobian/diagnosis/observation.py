@@ -15,6 +15,7 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.validate_full_topic_name import validate_full_topic_name
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState, LaserScan
@@ -27,7 +28,7 @@ from diffdrive_jacobian.diagnosis.graph import (
     Quality,
     Stream,
 )
-from diffdrive_jacobian.messages.cdr import DecodingError
+from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 from diffdrive_jacobian.messages.codecs import CLOCK as CLOCK_TIME
 from diffdrive_jacobian.messages.codecs import STAMP
 from diffdrive_jacobian.messages.names import full_name, node_of, type_name
@@ -35,7 +36,6 @@ from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.nodes.same_wheels import wheels_of
 from diffdrive_jacobian.parameters.wheels import WHEELS
 from diffdrive_jacobian.ros.runner import ros_context, running
-from diffdrive_jacobian.ros.serialization import reader
 from diffdrive_jacobian.ros.service_client import ServiceClient, ignore
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
@@ -257,7 +257,7 @@ def _nearer(one: float | None, other: float) -> float:
 
 def _stamp_reader(kind: type, fields: tuple[str, ...]) -> Callable[[bytes], int]:
     """Return a function that returns a time in a serialized message (ns); 0: it is none."""
-    read = reader(kind, fields, whole=False)
+    read = Reader(kind, fields, whole=False, deserialize=deserialize_message)
 
     def stamp(data: bytes) -> int:
         try:

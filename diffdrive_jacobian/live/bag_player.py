@@ -26,7 +26,7 @@ from diffdrive_jacobian.live.session import Session, Snapshot
 from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.names import base_name, namespace_of
-from diffdrive_jacobian.messages.topics import SENSORS, TOPICS
+from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -180,7 +180,6 @@ class RecordedRobot:
         self._configurations = list(run.configurations())
         self._configure(0)
         self._commands, self._wheels = self._times(run.cmd_vel), self._times(run.wheels)
-        self._sensors = {topic: self._times(getattr(run, topic.series)) for topic in SENSORS}
         self._truths = np.maximum.accumulate(self._times(run.ground_truth))
         self.trail, self._trail_times = _trail(self.time, run.odometry.values, self._line.breaks)
         self.true_trail, self._true_times = _trail(
@@ -207,11 +206,6 @@ class RecordedRobot:
         state.covariance = self._covariance[index]
         state.command = _latest(self._commands, run.cmd_vel, time, COMMAND_LIFE)
         state.wheels = _latest(self._wheels, run.wheels, time, WHEELS_LIFE)
-        state.readings = {}
-        for topic, times in self._sensors.items():
-            if latest := _count(times, time):
-                values = getattr(run, topic.series).values[latest - 1].tolist()
-                state.readings.update(zip(topic.columns, values, strict=True))
         self._set_goal(index)
         latest = _count(self._truths, time) - 1
         known = latest >= 0 and time - self._truths[latest] < TRUTH_LIFE

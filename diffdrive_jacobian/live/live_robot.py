@@ -37,7 +37,6 @@ from diffdrive_jacobian.live.session import Session
 from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, PATH, POSE, Motion, Route, Status
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError, from_covariance
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.nodes.remote_goal import ignores_heading
 from diffdrive_jacobian.nodes.stopping import rolls_on
 from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
@@ -184,11 +183,6 @@ class LiveRobot:
             self._on_odometry(followed['odom'], now)
         if (truth := followed['ground_truth']) is not None:
             self.state.truly_moved(seconds(truth.stamp), np.array(truth.pose), truth.twist)
-        for topic in SENSORS:
-            if topic.followed and (value := followed[topic.name]) is not None:
-                with suppress(MessageError):
-                    for row in topic.rows(value, self.state.wheel_names):
-                        self.state.readings.update(zip(topic.columns, row.values, strict=True))
         if (wheels := followed['joint_states']) is not None:
             try:
                 self.state.wheels = wheels.speeds(self.state.wheel_names)

@@ -27,7 +27,6 @@ from diffdrive_jacobian.messages.goal_status import (
     GoalState,
     Stamp,
 )
-from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 
@@ -256,8 +255,6 @@ class RobotState:
         """Speeds of the right and the left wheel (rad/s). None: unknown."""
         self.command: tuple[float, float] | None = None
         """Latest cmd_vel. None: none was received lately."""
-        self.readings: dict[str, float] = {}
-        """Latest values of sensors, by their names."""
         self.goal = GoalProgress()
         self.trail = Trail()
         self.truth: NDArray[np.float64] | None = None
@@ -402,11 +399,6 @@ class RobotState:
             'path_heading_error': rounded(None if path is None else path.heading),
             'truth': rounded(self.truth),
             'law': self._law(target if self.goal.active else None),
-            'readings': [
-                [name, rounded(self.readings.get(name)), unit]
-                for topic in SENSORS
-                for name, unit in topic.readings.items()
-            ],
             'by_hand': by_hand,
             'commanded': self.command is not None,
             'chain': quantities.chain(

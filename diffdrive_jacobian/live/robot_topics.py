@@ -133,7 +133,7 @@ class RobotTopics:
 
     def publish_twist(self, twist: tuple[float, float], now: int) -> None:
         """Publish a command, at a time (ns)."""
-        data = self._serialized_twist(twist, now)
+        data = self._serialized_twist(Command(twist, now))
         self._publisher(message_class(self._twist.type_name), 'cmd_vel').publish(data)
 
     def publish(

@@ -78,12 +78,18 @@ class Source:
         'message_type',
         'observers',
         'owner',
+        'send',
         'stages',
         'topic',
     )
 
     def __init__(
-        self, topic: str, message_type: Any, links: list[Link], observers: list[Published]
+        self,
+        topic: str,
+        message_type: Any,
+        links: list[Link],
+        observers: list[Published],
+        send: Callable[[bytes], None],
     ) -> None:
         """Start without messages.
 
@@ -92,8 +98,10 @@ class Source:
             message_type: Type of its messages.
             links: The links of the topic. The list stays up to date.
             observers: The functions that are called with each message that was sent.
+            send: Sends serialized messages.
         """
         self.topic = topic
+        self.send = send
         self.message_type = message_type
         self.links = links
         self.observers = observers

@@ -28,7 +28,13 @@ from diffdrive_jacobian.lockstep._gate import Gates, send_unless_destroyed
 from diffdrive_jacobian.lockstep._link import Delivered, Link, Published, Source, Stage, pass_on
 from diffdrive_jacobian.lockstep._services import Member
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
-from diffdrive_jacobian.ros.rclpy_internals import message_receiver, message_taker, wrap_publish
+from diffdrive_jacobian.ros.rclpy_internals import (
+    RCLError,
+    message_receiver,
+    message_taker,
+    raw_sender,
+    wrap_publish,
+)
 
 __tracebackhide__ = True
 
@@ -140,7 +146,15 @@ class Links:
                     source = links._source_of(self)
                 if (source.stages or gates.running) and links._divert(self, source, msg):
                     return
-                publish(self, msg)
+                if type(msg) is bytes:
+                    # Without the two calls of `Publisher.publish`.
+                    try:
+                        source.send(msg)
+                    except RCLError:
+                        # It raises what it raises for a publisher that was destroyed.
+                        publish(self, msg)
+                else:
+                    publish(self, msg)
                 source.count += 1
                 source.last = next(numbers), clocks.now, msg
                 extend(source.links)
@@ -154,13 +168,12 @@ class Links:
 
     def _source_of(self, publisher: Publisher) -> Source:
         """Return the source of a publisher that publishes for the first time."""
-        source = self._source(publisher.topic_name, publisher.msg_type)
+        topic = publisher.topic_name
+        links, observers = self.to(topic), self.observers_of_published(topic)
+        source = Source(topic, publisher.msg_type, links, observers, raw_sender(publisher))
         self._sources[publisher] = source
         self._find_owner(publisher, source)
         return source
-
-    def _source(self, topic: str, message_type: Any) -> Source:
-        return Source(topic, message_type, self.to(topic), self.observers_of_published(topic))
 
     def _find_owner(self, publisher: Publisher, source: Source) -> None:
         for node in self._members:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 import struct
-import sys
 from collections.abc import Callable
 from collections.abc import Sequence as Values
 from functools import lru_cache
@@ -41,18 +40,6 @@ from diffdrive_jacobian.messages.structure import (
     uniform_size,
 )
 
-SMALLEST = sys.float_info.min
-"""Smallest positive normal number. No speed or position is that small but zero."""
-
-
-def integer_warning(what: str, value: float) -> str:
-    """Return a warning of a value below `SMALLEST`: an integer that was assigned to a float field."""
-    return (
-        f'{what} has the value {value:.3g}: was an int assigned to a float field? Assign 1.0 '
-        'instead of 1 (with ROS_PYTHON_CHECK_FIELDS=1 rclpy reports it to the sender)'
-    )
-
-
 _MAX_LAYOUTS = 16
 """Layouts that a Reader keeps, one for each size of message."""
 _MAX_VALUES = 256
@@ -62,6 +49,8 @@ _MAX_ELEMENTS = 64
 _MAX_READ = 200_000
 """Most values of a message that are unpacked, and strings and structures that are visited one by one.
 More take seconds, and twenty times their size in memory."""
+_MAX_OTHER = 200_000
+"""Longest message in another encapsulation (bytes): rclpy creates an object for each structure in it."""
 _MAX_REMEMBERED = 1024
 """Largest message whose texts are remembered (bytes)."""
 
@@ -90,6 +79,7 @@ class Reader:
         self,
         kind: Any,
         fields: Values[str],
+        value: Callable[..., Any] = lambda *fields: fields,
         *,
         whole: bool = True,
         bounded: bool = True,
@@ -102,6 +92,8 @@ class Reader:
             fields: Paths such as `header.stamp.sec`. A path to a number gives a number, to a string a
                 str, to an array or sequence of them a tuple. `len(goals)` gives the length of a
                 sequence, `goals[].pose.position.x` a tuple with that field of each of its elements.
+            value: Makes a value of the fields, one argument each. What it raises is passed on. By
+                default their tuple.
             whole: Whether what follows the last field must be valid too.
             bounded: Whether to refuse messages with more than 200,000 values and strings to read.
             deserialize: `rclpy.serialization.deserialize_message`, for other encapsulations than that
@@ -118,13 +110,14 @@ class Reader:
         self._fields = tuple(fields)
         for field in self._fields:
             check_readable(self._type, field)
+        self._value = value
         self._whole = whole
         self._budget = _MAX_READ if bounded else math.inf
         self._deserialize = deserialize
         self._layouts: dict[int, _Layout] = {}
 
-    def __call__(self, data: bytes) -> tuple[Any, ...]:
-        """Return the fields of a message, in the order in which they were asked for.
+    def __call__(self, data: bytes) -> Any:
+        """Return the value of a message.
 
         As in rclpy, bytes after the message are ignored, strings end at the first NUL, and invalid UTF-8
         is replaced by U+FFFD. Unlike rclpy, a sequence that claims more elements than there are bytes is
@@ -136,12 +129,11 @@ class Reader:
             LongMessageError: They are, as far as they were read, but have too many values.
         """
         layout = self._layouts.get(len(data))
-        if layout is None:
-            return self._read_new(data)
-        values = layout.unpack_from(data)
-        if layout.lengths(values) != layout.expected:
-            return self._read_new(data)
-        return layout.fields(values)
+        if layout is not None:
+            values = layout.unpack_from(data)
+            if layout.lengths(values) == layout.expected:
+                return self._value(*layout.fields(values))
+        return self._value(*self._read_new(data))
 
     def _read_new(self, data: bytes) -> tuple[Any, ...]:
         """Read a message whose layout is not known."""
@@ -167,6 +159,11 @@ class Reader:
             raise DecodingError(
                 f'a {self._type.short_name} message must be little-endian CDR, which begins with 0001, '
                 f'if rclpy does not read it; it begins with {data[:2].hex()}'
+            )
+        if data[:2] != LITTLE_ENDIAN and len(data) > _MAX_OTHER:
+            raise DecodingError(
+                f'a {self._type.short_name} message must have at most {_MAX_OTHER} bytes, unless it is '
+                f'little-endian CDR, got {len(data)}'
             )
         try:
             message = self._deserialize(data, self._class)
@@ -384,7 +381,7 @@ class Writer:
         self,
         template: Any,
         fields: Values[str],
-        numbers: Callable[..., tuple[Any, ...]] = lambda *values: values,
+        numbers: Callable[[Any], tuple[Any, ...]] = lambda values: values,
     ) -> None:
         """Serialize the template.
 
@@ -394,8 +391,7 @@ class Writer:
             fields: Paths of the numbers that are written, in the order of the message:
                 `pose.position.x`, `covariance[7]` for an element, `covariance` for all elements of an
                 array or sequence.
-            numbers: Returns these numbers, one for each field or element of a field, given the arguments
-                of a call.
+            numbers: Returns these numbers of a value, one for each field or element of a field.
 
         Raises:
             ValueError: A field does not exist, is no number, or is not in the order of the message.
@@ -428,13 +424,13 @@ class Writer:
         self._constants, self._in_order = tuple(reversed(constants)), itemgetter(*order)
         self._pack = struct.Struct(layout).pack
 
-    def __call__(self, *values: Any) -> bytes:
-        """Return the message with the numbers of these values.
+    def __call__(self, value: Any) -> bytes:
+        """Return the message with the numbers of a value.
 
         Raises:
             MessageError: A number is out of range for its field, or their count is wrong.
         """
-        numbers = self._numbers(*values)
+        numbers = self._numbers(value)
         if len(numbers) != self._count:
             raise MessageError(
                 f'{self._name} cannot be serialized: it needs {self._count} numbers, got {len(numbers)}'

@@ -24,10 +24,14 @@ from diffdrive_jacobian.messages.conversion import (
     from_pose,
     from_time,
     from_twist,
+    quoted,
 )
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 V = TypeVar('V')
+Texts = tuple[str, ...]
+Column = tuple[Any, ...]
+"""A field of each element of a sequence."""
 
 STAMP = ('header.stamp.sec', 'header.stamp.nanosec')
 FRAME = 'header.frame_id'
@@ -63,8 +67,8 @@ class Codec(Generic[V]):
     """Returns the value of these fields. It raises MessageError if they are invalid."""
     written: tuple[str, ...] = ()
     """Paths of the numbers that are written, as `cdr.Writer` takes them."""
-    numbers: Callable[..., tuple[Any, ...]] = lambda *_: ()
-    """Returns these numbers, given the fields of a value."""
+    numbers: Callable[[V], tuple[Any, ...]] = lambda _: ()
+    """Returns these numbers of a value."""
     header: Codec[Any] | None = None
     """What is read and checked before the rest, which may be long."""
 
@@ -76,20 +80,20 @@ class Codec(Generic[V]):
         It raises MessageError: DecodingError if the bytes are not a message of the type, and others if
         the value is invalid.
         """
-        read, value = Reader(kind, self.fields, deserialize=deserialize), self.value
+        read = Reader(kind, self.fields, self.value, deserialize=deserialize)
         if self.header is None:
-            return lambda data: value(*read(data))
-        first = Reader(kind, self.header.fields, whole=False, deserialize=deserialize)
-        check = self.header.value
+            return read
+        check = Reader(kind, self.header.fields, self.header.value, whole=False, deserialize=deserialize)
 
         def checked(data: bytes) -> V:
-            check(*first(data))
-            return value(*read(data))
+            check(data)
+            value: V = read(data)
+            return value
 
         return checked
 
     def writer(self, template: Any) -> Writer:
-        """Return what serializes values from their fields, with strings and lengths of a template."""
+        """Return what serializes values, with the strings and the lengths of a template."""
         return Writer(template, self.written, self.numbers)
 
 
@@ -106,11 +110,6 @@ def pose_fields(type_name: str) -> tuple[str, ...]:
 
 _POSE = ('position.x', 'position.y', *(f'orientation.{axis}' for axis in 'xyzw'))
 _PLANAR_POSE = ('position.x', 'position.y', 'orientation.z', 'orientation.w')
-
-
-def _pose_numbers(pose: tuple[float, float, float]) -> tuple[float, float, float, float]:
-    x, y, theta = pose
-    return x, y, math.sin(theta / 2.0), math.cos(theta / 2.0)
 
 
 # --- Commands: cmd_vel, cmd_vel_out
@@ -130,14 +129,14 @@ TWIST = Codec(
     twist_fields('geometry_msgs/msg/Twist'),
     lambda *twist: Command(from_twist(*twist)),
     ('linear.x', 'angular.z'),
-    lambda twist, stamp=0: twist,
+    itemgetter(0),
 )
 TWIST_STAMPED = Codec(
     'geometry_msgs/msg/TwistStamped',
     (*STAMP, *twist_fields('geometry_msgs/msg/TwistStamped')),
     lambda sec, nanosec, *twist: Command(from_twist(*twist), from_time(sec, nanosec)),
     (*STAMP, 'twist.linear.x', 'twist.angular.z'),
-    lambda twist, stamp: (*divmod(stamp, NANOSECONDS), *twist),
+    lambda command: (*divmod(command[1], NANOSECONDS), *command[0]),
 )
 
 # --- Poses: odom, ground_truth, start_pose, initialpose
@@ -161,6 +160,17 @@ class Motion(NamedTuple):
     """Of x, y, theta, row by row; not checked, see `covariances.from_covariance`."""
     twist_covariance: tuple[float, ...] = _ZERO_TWIST_COVARIANCE
     """Of v and omega, row by row; not checked."""
+
+
+class State(NamedTuple):
+    """Pose and twist now."""
+
+    frame: str
+    """Frame of the pose."""
+    pose: tuple[float, float, float]
+    """`(x, y, theta)` (m, m, rad)."""
+    twist: tuple[float, float]
+    """`(v, omega)` in the body frame (m/s, rad/s); not checked."""
 
 
 class Place(NamedTuple):
@@ -188,16 +198,16 @@ def _motion(sec: int, nanosec: int, frame: str, *values: Any) -> Motion:
     )
 
 
-def _motion_numbers(
-    stamp: int,
-    frame: str,
-    pose: tuple[float, float, float],
-    twist: tuple[float, float],
-    covariance: tuple[float, ...] = _ZERO_POSE_COVARIANCE,
-    twist_covariance: tuple[float, ...] = _ZERO_TWIST_COVARIANCE,
-) -> tuple[float, ...]:
-    times = divmod(stamp, NANOSECONDS)
-    return (*times, *_pose_numbers(pose), *covariance, *twist, *twist_covariance)
+def _motion_numbers(motion: Motion) -> tuple[float, ...]:
+    stamp, _, (x, y, theta), twist, covariance, twist_covariance = motion
+    orientation = math.sin(theta / 2.0), math.cos(theta / 2.0)
+    return (*divmod(stamp, NANOSECONDS), x, y, *orientation, *covariance, *twist, *twist_covariance)
+
+
+def _place_numbers(place: Place) -> tuple[float, ...]:
+    stamp, _, (x, y, theta), covariance = place
+    orientation = math.sin(theta / 2.0), math.cos(theta / 2.0)
+    return (*divmod(stamp, NANOSECONDS), x, y, *orientation, *covariance)
 
 
 def _place(sec: int, nanosec: int, frame: str, *values: Any) -> Place:
@@ -240,9 +250,9 @@ ODOMETRY_STATE = Codec(
         *(FRAME, 'twist.twist.linear.x', 'twist.twist.angular.z'),
         *pose_fields('nav_msgs/msg/Odometry'),
     ),
-    lambda frame, v, omega, *pose: (frame, (v, omega), from_pose(*pose)),
+    lambda frame, v, omega, *pose: State(frame, from_pose(*pose), (v, omega)),
 )
-"""Frame, twist and pose of an odometry, for the controller. The twist is not checked."""
+"""Odometry as the controller needs it."""
 POSE_WITH_COVARIANCE = Codec(
     'geometry_msgs/msg/PoseWithCovarianceStamped',
     (
@@ -252,14 +262,19 @@ POSE_WITH_COVARIANCE = Codec(
     ),
     _place,
     _WRITTEN_PLACE,
-    lambda stamp, frame, pose, covariance=_ZERO_POSE_COVARIANCE: (
-        *divmod(stamp, NANOSECONDS),
-        *_pose_numbers(pose),
-        *covariance,
-    ),
+    _place_numbers,
 )
 
 # --- Goals: goal_pose, goals, path, goal_status
+
+
+class GoalError(MessageError):
+    """Goals that are invalid, in a message whose stamp was read."""
+
+    def __init__(self, why: str, stamp: tuple[int, int]) -> None:
+        """Say why, and by which stamp the goals are known."""
+        super().__init__(why)
+        self.stamp = stamp
 
 
 class Route(NamedTuple):
@@ -268,36 +283,16 @@ class Route(NamedTuple):
     stamp: tuple[int, int]
     """`sec` and `nanosec`, by which goals are told apart, and which may be anything."""
     frame: str
-    """Frame of those that name none."""
+    """Frame of all of them."""
     poses: tuple[tuple[float, float, float], ...]
     """`(x, y, theta)` of each (m, m, rad)."""
-    frames: tuple[str, ...] = ()
-    """Their frames; empty: `frame`."""
-    stamps: tuple[tuple[int, int], ...] = ()
-    """Their stamps in a path."""
+    times: tuple[float, ...] | None = None
+    """Time of each since the first (s), of a trajectory."""
 
     @property
     def time(self) -> int:
         """The stamp as a time (ns), or a MessageError."""
         return from_time(*self.stamp)
-
-    @property
-    def times(self) -> tuple[float, ...] | None:
-        """Time of each pose since the first (s), of a trajectory; None: all stamps are equal.
-
-        Raises:
-            MessageError: A stamp is none, or the stamps neither increase nor are all equal.
-        """
-        if len(set(self.stamps)) <= 1:
-            return None
-        stamps = [from_time(*stamp) for stamp in self.stamps]
-        for index, (one, two) in enumerate(pairwise(stamps)):
-            if one >= two:
-                raise MessageError(
-                    'stamps of the poses must increase, or all be equal for a path without times, got '
-                    f'{two / NANOSECONDS:.9f} s after {one / NANOSECONDS:.9f} s at pose {index + 1}'
-                )
-        return tuple((stamp - stamps[0]) / NANOSECONDS for stamp in stamps)
 
 
 class Status(NamedTuple):
@@ -314,36 +309,92 @@ class Status(NamedTuple):
         return from_time(*self.stamp)
 
 
-def _at_most(most: int, what: str) -> Callable[[int, int, int], tuple[tuple[int, int], int]]:
-    def header(sec: int, nanosec: int, count: int) -> tuple[tuple[int, int], int]:
+def _pose(sec: int, nanosec: int, frame: str, *pose: float) -> Route:
+    return _route((sec, nanosec), frame, (frame,), [pose])
+
+
+def _goals(sec: int, nanosec: int, frame: str, frames: Texts, *columns: Column) -> Route:
+    stamp, poses = (sec, nanosec), [*zip(*columns, strict=True)]
+    if not poses:
+        raise GoalError(f'goals must contain at least one pose, got none ({TO_STOP})', stamp)
+    return _route(stamp, frame, frames, poses)
+
+
+def _path(
+    sec: int, nanosec: int, frame: str, frames: Texts, secs: Column, nanosecs: Column, *columns: Column
+) -> Route:
+    stamp, poses = (sec, nanosec), [*zip(*columns, strict=True)]
+    if len(poses) < 2:
+        raise GoalError(
+            f'path must contain at least two poses, got {len(poses)} ({TO_STOP}; to drive to one pose, '
+            'publish goal_pose)',
+            stamp,
+        )
+    return _route(stamp, frame, frames, poses, zip(secs, nanosecs, strict=True))
+
+
+def _route(
+    stamp: tuple[int, int],
+    frame: str,
+    frames: Texts,
+    poses: Iterable[Column],
+    stamps: Iterable[tuple[int, int]] = (),
+) -> Route:
+    """Return goals, or raise a GoalError.
+
+    Args:
+        stamp: Stamp of the message.
+        frame: Frame of those that name none.
+        frames: Their frames.
+        poses: Their poses, as `from_pose` takes them.
+        stamps: Their stamps in a path.
+    """
+    distinct = {one or frame for one in frames}
+    try:
+        if len(distinct) > 1:
+            raise MessageError(f'all poses must be given in one frame, got {quoted(sorted(distinct))}')
+        return Route(stamp, distinct.pop(), tuple(from_pose(*pose) for pose in poses), _times([*stamps]))
+    except MessageError as error:
+        raise GoalError(str(error), stamp) from error
+
+
+def _times(stamps: list[tuple[int, int]]) -> tuple[float, ...] | None:
+    """Return the time of each pose since the first (s), of a trajectory; None: all stamps are equal."""
+    if len(set(stamps)) <= 1:
+        return None
+    times = [from_time(*stamp) for stamp in stamps]
+    for index, (one, two) in enumerate(pairwise(times)):
+        if one >= two:
+            raise MessageError(
+                'stamps of the poses must increase, or all be equal for a path without times, got '
+                f'{two / NANOSECONDS:.9f} s after {one / NANOSECONDS:.9f} s at pose {index + 1}'
+            )
+    return tuple((time - times[0]) / NANOSECONDS for time in times)
+
+
+def _at_most(most: int, what: str) -> Codec[Any]:
+    """Return what is read of goals before their poses, to refuse too many."""
+
+    def check(sec: int, nanosec: int, count: int) -> None:
         if count > most:
-            raise MessageError(f'{what} must contain at most {most} poses, got {count}')
-        return (sec, nanosec), count
+            raise GoalError(f'{what} must contain at most {most} poses, got {count}', (sec, nanosec))
 
-    return header
-
-
-def _poses(columns: Iterable[tuple[float, ...]]) -> tuple[tuple[float, float, float], ...]:
-    return tuple(from_pose(*pose) for pose in zip(*columns, strict=True))
+    poses = 'goals' if what == 'goals' else 'poses'
+    return Codec('', (*STAMP, f'len({poses})'), check)
 
 
+TO_STOP = 'to stop, call cancel_goal'
 POSE = Codec(
     'geometry_msgs/msg/PoseStamped',
     (*STAMP, FRAME, *pose_fields('geometry_msgs/msg/PoseStamped')),
-    lambda sec, nanosec, frame, *pose: Route((sec, nanosec), frame, (from_pose(*pose),)),
-    (*STAMP, *(f'pose.{field}' for field in _PLANAR_POSE)),
-    lambda stamp, frame, poses, *_: (*stamp, *_pose_numbers(poses[0])),
+    _pose,
 )
-GOALS_HEADER = Codec('nav_msgs/msg/Goals', (*STAMP, 'len(goals)'), _at_most(MAX_WAYPOINTS, 'goals'))
-"""Stamp and number of poses."""
 GOALS = Codec(
     'nav_msgs/msg/Goals',
     (*STAMP, FRAME, 'goals[].header.frame_id', *(f'goals[].pose.{field}' for field in _POSE)),
-    lambda sec, nanosec, frame, frames, *columns: Route((sec, nanosec), frame, _poses(columns), frames),
-    header=GOALS_HEADER,
+    _goals,
+    header=_at_most(MAX_WAYPOINTS, 'goals'),
 )
-PATH_HEADER = Codec('nav_msgs/msg/Path', (*STAMP, 'len(poses)'), _at_most(MAX_PATH_POSES, 'path'))
-"""Stamp and number of poses."""
 PATH = Codec(
     'nav_msgs/msg/Path',
     (
@@ -351,10 +402,8 @@ PATH = Codec(
         *(f'poses[].header.{field}' for field in ('frame_id', 'stamp.sec', 'stamp.nanosec')),
         *(f'poses[].pose.{field}' for field in _POSE),
     ),
-    lambda sec, nanosec, frame, frames, secs, nanosecs, *columns: Route(
-        (sec, nanosec), frame, _poses(columns), frames, tuple(zip(secs, nanosecs, strict=True))
-    ),
-    header=PATH_HEADER,
+    _path,
+    header=_at_most(MAX_PATH_POSES, 'path'),
 )
 GOAL_STATUS = Codec(
     'action_msgs/msg/GoalStatus',
@@ -415,23 +464,24 @@ class WheelArray(NamedTuple):
         return from_joints(names, self.velocities, names)
 
 
+def _wheel_numbers(wheels: Wheels) -> tuple[float, ...]:
+    stamp, _, positions, velocities = wheels
+    return (*divmod(stamp, NANOSECONDS), *positions, *velocities)
+
+
 JOINT_STATE = Codec(
     'sensor_msgs/msg/JointState',
     (*STAMP, 'name', 'position', 'velocity'),
     lambda sec, nanosec, *values: Wheels(from_time(sec, nanosec), *values),
     (*STAMP, 'position', 'velocity'),
-    lambda stamp, joints, positions, velocities: (
-        *divmod(stamp, NANOSECONDS),
-        *positions,
-        *velocities,
-    ),
+    _wheel_numbers,
 )
 WHEEL_ARRAY = Codec(
     'std_msgs/msg/Float64MultiArray',
     ('data',),
     WheelArray,
     ('data',),
-    lambda velocities, stamp=0: velocities,
+    itemgetter(0),
 )
 
 # --- Events: parameter_events, fault_events

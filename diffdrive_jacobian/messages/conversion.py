@@ -12,6 +12,7 @@ are is said in `messages.codecs`.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
@@ -39,11 +40,24 @@ MAX_WHEEL_SPEED = 1e6
 the nodes accept, 1e-3 m."""
 
 
+SMALLEST = sys.float_info.min
+"""Smallest positive normal number. No speed or position is that small but zero."""
 MAX_WAYPOINTS = 2_000
 """Largest number of poses in a `goals` message: rclpy takes about 20 us to convert each of them."""
 MAX_PATH_POSES = 10_000
 """Largest number of poses in a `path` message, which take a quarter of a second to read. At the 5 cm of
 common planners this is a path of 500 m."""
+
+
+def integer_warning(what: str, *values: float) -> str:
+    """Return a warning if a value is below `SMALLEST`: an integer that was assigned to a float field."""
+    for value in values:
+        if value and -SMALLEST < value < SMALLEST:
+            return (
+                f'{what} has the value {value:.3g}: was an int assigned to a float field? Assign 1.0 '
+                'instead of 1 (with ROS_PYTHON_CHECK_FIELDS=1 rclpy reports it to the sender)'
+            )
+    return ''
 
 
 def quoted(texts: Iterable[str], most: int = 4) -> str:

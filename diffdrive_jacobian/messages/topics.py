@@ -1,4 +1,4 @@
-"""The topics of the robot, each defined once, and the faults that a topic may have.
+"""The topics of the robot, each defined once.
 
 A new topic is an entry in `TOPICS`, its codec in `messages.codecs`, and the node that publishes it.
 """
@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from diffdrive_jacobian.messages import codecs
 from diffdrive_jacobian.messages.codecs import Codec
-from diffdrive_jacobian.text import listed
 
 Names = tuple[str, str]
 """Names of the left and the right wheel joint."""
@@ -27,6 +26,19 @@ class Row(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Recorded:
+    """What the messages of a topic are in a run: rows of a table."""
+
+    series: str
+    """Field of `Run` with the table. Several topics may have one."""
+    columns: tuple[str, ...]
+    rows: Callable[[Any, Names], Iterable[Row]]
+    """Returns the rows of a value. It raises MessageError if the value lacks what is needed."""
+    covariances: tuple[str, ...] = ()
+    """Names of the values that follow those of the columns in the rows."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Topic:
     """A topic, and what the tools do with it."""
 
@@ -34,21 +46,12 @@ class Topic:
     """Without namespace; of one that all robots share, from `/` on."""
     codecs: tuple[Codec[Any], ...] = ()
     """One for each type that it may have. Empty: its messages are only passed on."""
-    recorded: bool = True
+    of_run: bool = True
     """Whether it is recorded as part of a run."""
     of_robot: bool = True
     """Whether its messages are the behaviour of a robot, and not of ROS or of the test."""
-    series: str = ''
-    """Field of `Run` with its values, or ''."""
-    columns: tuple[str, ...] = ()
-    """Names of these values."""
-    units: tuple[str, ...] = ()
-    """Units of the columns of a sensor, which are tabulated, drawn and shown by their names. Empty: what
-    draws and shows them knows what they mean."""
-    covariances: tuple[str, ...] = ()
-    """Names of the values that follow them in the rows."""
-    rows: Callable[[Any, Names], Iterable[Row]] = lambda value, names: ()
-    """Returns the rows of a value. It raises MessageError if the value lacks what is needed."""
+    table: Recorded | None = None
+    """What its messages are in a run; None: no table."""
     followed: bool = False
     """Whether the live page looks at its latest value."""
     if_unread: str = ''
@@ -69,14 +72,9 @@ class Topic:
         return self.name.removeprefix('/')
 
     @property
-    def readings(self) -> dict[str, str]:
-        """Names and units of the columns of a sensor; {}: it is none."""
-        return dict(zip(self.columns, self.units, strict=True)) if self.units else {}
-
-    @property
     def readable(self) -> bool:
         """Whether reading a run takes something from it."""
-        return bool(self.series) or self.name in (PARAMETER_EVENTS, FAULT_EVENTS)
+        return self.table is not None or self.name in (PARAMETER_EVENTS, FAULT_EVENTS)
 
     def codec(self, type_name: str) -> Codec[Any]:
         """Return the codec of a type that it may have.
@@ -97,7 +95,8 @@ class Topic:
 _POSE = ('x', 'y', 'theta')
 _TWIST = ('v', 'omega')
 _WHEELS = ('omega_R', 'omega_L')
-_OF_POSE = ('xx', 'xy', 'xt', 'yy', 'yt', 'tt')
+OF_POSE = ('xx', 'xy', 'xt', 'yy', 'yt', 'tt')
+"""Names of the covariances of a pose in a run."""
 _OF_TWIST = ('vv', 'vw', 'ww')
 
 
@@ -156,25 +155,23 @@ TOPICS = {
         Topic(
             name='cmd_vel',
             codecs=(codecs.TWIST, codecs.TWIST_STAMPED),
-            series='cmd_vel',
-            columns=_TWIST,
-            rows=_command,
+            table=Recorded(series='cmd_vel', columns=_TWIST, rows=_command),
             if_unread='start virtual_robot, wheel_bridge or the driver of your robot',
         ),
         Topic(
             name='cmd_vel_out',
             codecs=(codecs.TWIST_STAMPED,),
-            series='cmd_vel_out',
-            columns=_TWIST,
-            rows=_command,
+            table=Recorded(series='cmd_vel_out', columns=_TWIST, rows=_command),
         ),
         Topic(
             name='odom',
             codecs=(codecs.ODOMETRY,),
-            series='odometry',
-            columns=_POSE + _TWIST,
-            covariances=_OF_POSE + _OF_TWIST,
-            rows=_odometry,
+            table=Recorded(
+                series='odometry',
+                columns=_POSE + _TWIST,
+                rows=_odometry,
+                covariances=OF_POSE + _OF_TWIST,
+            ),
             followed=True,
             if_unpublished='start virtual_robot or the driver of your robot',
             if_several='their poses alternate; stop one of them, or give each robot a namespace '
@@ -183,59 +180,44 @@ TOPICS = {
         Topic(
             name='ground_truth',
             codecs=(codecs.MOTION,),
-            series='ground_truth',
-            columns=_POSE + _TWIST,
-            rows=_motion,
+            table=Recorded(series='ground_truth', columns=_POSE + _TWIST, rows=_motion),
             followed=True,
         ),
         Topic(
             name='start_pose',
             codecs=(codecs.POSE_WITH_COVARIANCE,),
-            series='start_pose',
-            columns=_POSE,
-            covariances=_OF_POSE,
-            rows=_place,
+            table=Recorded(series='start_pose', columns=_POSE, rows=_place, covariances=OF_POSE),
             if_several='give each robot a namespace (-r __ns:=/NAME)',
         ),
         Topic(name='initialpose', codecs=(codecs.POSE_WITH_COVARIANCE,)),
         Topic(
             name='goal_pose',
             codecs=(codecs.POSE,),
-            series='goals',
-            columns=_POSE,
-            rows=_route,
+            table=Recorded(series='goals', columns=_POSE, rows=_route),
             if_unread='start go_to_goal',
         ),
         Topic(
             name='goals',
             codecs=(codecs.GOALS,),
-            series='goals',
-            columns=_POSE,
-            rows=_route,
+            table=Recorded(series='goals', columns=_POSE, rows=_route),
             if_unread='start go_to_goal',
         ),
         Topic(
             name='path',
             codecs=(codecs.PATH,),
-            series='planned_path',
-            columns=(*_POSE, 't'),
-            rows=_path,
+            table=Recorded(series='planned_path', columns=(*_POSE, 't'), rows=_path),
             if_unread='start go_to_goal',
         ),
         Topic(
             name='goal_status',
             codecs=(codecs.GOAL_STATUS,),
-            series='goal_status',
-            columns=('status',),
-            rows=_status,
+            table=Recorded(series='goal_status', columns=('status',), rows=_status),
             if_several='two controllers drive one robot; stop one of them, or give each a namespace',
         ),
         Topic(
             name='joint_command',
             codecs=(codecs.JOINT_STATE, codecs.WHEEL_ARRAY),
-            series='wheel_commands',
-            columns=_WHEELS,
-            rows=_wheels,
+            table=Recorded(series='wheel_commands', columns=_WHEELS, rows=_wheels),
             if_unread='start virtual_robot with -p command_interface:=wheels, or your motor driver',
             if_unpublished='start wheel_bridge (or the robot without command_interface:=wheels)',
             if_several='their commands alternate; stop one of them, or give each robot a namespace',
@@ -243,32 +225,28 @@ TOPICS = {
         Topic(
             name='joint_states',
             codecs=(codecs.JOINT_STATE,),
-            series='wheels',
-            columns=_WHEELS,
-            rows=_wheels,
+            table=Recorded(series='wheels', columns=_WHEELS, rows=_wheels),
             followed=True,
         ),
         Topic(name=TRANSFORMS),
         Topic(name=PARAMETER_EVENTS, codecs=(codecs.PARAMETER_EVENT,), of_robot=False),
         Topic(name=FAULT_EVENTS, codecs=(codecs.FAULT_EVENT,), of_robot=False),
-        Topic(name=CLOCK, codecs=(codecs.CLOCK,), recorded=False, of_robot=False),
-        Topic(name=ROSOUT, recorded=False, of_robot=False),
+        Topic(name=CLOCK, codecs=(codecs.CLOCK,), of_run=False, of_robot=False),
+        Topic(name=ROSOUT, of_run=False, of_robot=False),
     )
 }
 """All topics of the package by their names."""
-SAME_NAMES = 'in the same namespace, or remap the topic ({}:=NAME)'
-"""Where to start what `Topic.if_unread` and `Topic.if_unpublished` say."""
 OF_EVERY_NODE = (PARAMETER_EVENTS, ROSOUT)
 """Topics that every node publishes."""
 NOT_OF_ROBOTS = tuple(topic.name for topic in TOPICS.values() if not topic.of_robot)
 """Topics that do not belong to the behaviour of the nodes."""
-SENSORS = [topic for topic in TOPICS.values() if topic.units]
-"""Topics whose values are tabulated, drawn and shown by their names."""
+TABLES = [topic.table for topic in TOPICS.values() if topic.table is not None]
+"""The tables of a run. Those of one series have the same columns."""
 READABLE = {topic.base_name: topic for topic in TOPICS.values() if topic.readable}
 """Topics from which a run is read, by their names without namespace."""
 
 
-RUN_TOPICS = tuple(topic.name for topic in TOPICS.values() if topic.recorded)
+RUN_TOPICS = tuple(topic.name for topic in TOPICS.values() if topic.of_run)
 """The topics of a run."""
 
 
@@ -282,92 +260,3 @@ class Selection:
     """Whether to record every topic that is not hidden."""
     pattern: str = ''
     """Regular expression. Topics in whose full name it is found are recorded as well."""
-
-
-OF_SOMEBODY_ELSE = (
-    "if it is somebody else's, a ROS_DOMAIN_ID of your own keeps it away, or, if it is on another "
-    'machine of this network, ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST'
-)
-"""What to do about a second node of the same name."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class TopicFault:
-    """A fault that a topic may have."""
-
-    present: Callable[[int, int], bool]
-    """Returns whether it is present with so many publishers and subscriptions."""
-    log: str
-    """Line of the log, with `{topic}`, `{publishers}`, `{remedy}` and `{killed}`."""
-    finding: str
-    """Finding of the doctor, with `{topic}`, `{publishers}` and `{subscriptions}`."""
-    remedy: Callable[[Topic], str]
-    """Returns what to do about it. Empty: a topic of this kind may be so."""
-    problem: bool = True
-    """Whether something does not work with it."""
-
-    def logged(self, topic: str, known: Topic, publishers: list[str]) -> str:
-        """Return the line for the log of a node.
-
-        Args:
-            topic: Fully qualified name of the topic.
-            known: The topic before it is remapped.
-            publishers: The nodes that publish it.
-        """
-        # The graph keeps a node that was killed for 20 s, also beside its successor.
-        repeated = len({*publishers}) < len(publishers)
-        return self.log.format(
-            topic=topic,
-            publishers=listed(publishers),
-            remedy=self.remedy(known),
-            killed=f'; one that was killed disappears within 20 s; {OF_SOMEBODY_ELSE}'
-            if repeated
-            else '',
-        )
-
-    def found(self, topic: str, publishers: list[str], subscriptions: list[str]) -> str:
-        """Return the finding of the doctor, without what to do about it."""
-        return self.finding.format(
-            topic=topic, publishers=listed(publishers), subscriptions=listed(subscriptions)
-        )
-
-
-def _start(program: str, known: Topic) -> str:
-    return f'{program} {SAME_NAMES.format(known.name)}' if program else ''
-
-
-UNREAD = TopicFault(
-    present=lambda publishers, subscriptions: publishers > 0 and subscriptions <= 0,
-    log='no node is subscribed to {topic}: {remedy}',
-    finding='{publishers} publishes {topic}, but nobody subscribes to it',
-    remedy=lambda known: _start(known.if_unread, known),
-)
-GOALS_LOST = replace(
-    UNREAD,
-    log='{publishers} publishes {topic}, but no controller is subscribed to it, so that goals are lost: '
-    '{remedy}',
-)
-UNPUBLISHED = TopicFault(
-    present=lambda publishers, subscriptions: subscriptions > 0 and not publishers,
-    log='no node publishes {topic}: {remedy}',
-    finding='{subscriptions} subscribes to {topic}, but nobody publishes it',
-    remedy=lambda known: _start(known.if_unpublished, known),
-)
-SEVERAL = TopicFault(
-    present=lambda publishers, subscriptions: publishers > 1,
-    log='{publishers} publish {topic}: {remedy}{killed}',
-    finding='{publishers} publish {topic}',
-    remedy=lambda known: known.if_several,
-)
-ALTERNATING = TopicFault(
-    present=SEVERAL.present,
-    log='{publishers} publish {topic}, and their commands alternate: stop one of them, or put a '
-    'multiplexer such as twist_mux between',
-    finding='{publishers} publish {topic}: the robot follows the last command of either',
-    remedy=lambda known: (
-        'drive by hand only while no goal is active, or use a multiplexer such as twist_mux'
-        if known.name == 'cmd_vel'
-        else ''
-    ),
-    problem=False,
-)

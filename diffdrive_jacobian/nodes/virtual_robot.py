@@ -6,9 +6,6 @@ The unicycle model is integrated exactly. The motion depends on the commands and
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +16,7 @@ from geometry_msgs.msg import (
     TwistStamped,
 )
 from nav_msgs.msg import Odometry
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from rclpy.clock import JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -28,7 +25,6 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages.cdr import SMALLEST
 from diffdrive_jacobian.messages.codecs import (
     JOINT_STATE,
     ODOMETRY,
@@ -36,19 +32,25 @@ from diffdrive_jacobian.messages.codecs import (
     TWIST,
     TWIST_STAMPED,
     Command,
+    Motion,
+    Place,
     Wheels,
 )
-from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
-from diffdrive_jacobian.messages.topics import GOALS_LOST, SEVERAL, UNPUBLISHED
+from diffdrive_jacobian.messages.conversion import (
+    SMALLEST,
+    MessageError,
+    from_covariance,
+    plausible_twist,
+)
+from diffdrive_jacobian.messages.topic_faults import GOALS_LOST, SEVERAL, UNPUBLISHED
+from diffdrive_jacobian.nodes.robot_defects import RobotDefects
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.ros.graph_faults import topic_check
-from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
+from diffdrive_jacobian.ros.node import NO_CLOCK, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
 from diffdrive_jacobian.ros.serialization import Interleaving
 from diffdrive_jacobian.ros.watchdog import command_time
-from diffdrive_jacobian.simulation.encoders import Encoders
-from diffdrive_jacobian.simulation.robot import Robot, RobotModel
-from diffdrive_jacobian.simulation.slip import Drift
+from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds, seconds
 
@@ -83,17 +85,16 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         if drifts:
             self._ground_truth = self.advertise(Odometry, 'ground_truth')
         self._transforms = self._transform_broadcaster() if self.parameters.enable_odom_tf else None
-        source, numbers = 'cmd_vel', Interleaving()
-        self._commands = numbers
+        self._commands = Interleaving()
+        commands: dict[str, Any] = {'called': 'command', 'numbers': self._commands}
         if self.parameters.command_interface == 'wheels':
-            source, apply = 'joint_command', partial(self._apply, self._read_joint_command)
-            self.subscribe(JointState, source, apply, codec=JOINT_STATE, numbers=numbers)
+            source = 'joint_command'
+            self.subscribe(JointState, source, self._on_wheels, codec=JOINT_STATE, **commands)
             self.watch(topic_check(self, UNPUBLISHED, source))
         else:
-            stamped = self.parameters.enable_stamped_cmd_vel
+            source, stamped = 'cmd_vel', self.parameters.enable_stamped_cmd_vel
             kind, codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
-            apply = partial(self._apply, codec.value)
-            self.subscribe(kind, source, apply, codec=codec, numbers=numbers)
+            self.subscribe(kind, source, self._on_command, codec=codec, **commands)
         self.watch(topic_check(self, SEVERAL, 'odom'))
         lost = [topic_check(self, GOALS_LOST, name) for name in ('goal_pose', 'goals')]
         self.watch(lambda: next(filter(None, (check() for check in lost)), None))
@@ -152,8 +153,12 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._robot, self._latest = robot, now
         return now, robot
 
-    def _present(self) -> tuple[int, Robot]:
-        """As `_advance`, but raise MessageError if simulated time has not started."""
+    def present(self) -> tuple[int, Robot]:
+        """Return the time (ns) and the robot, as they are now.
+
+        Raises:
+            MessageError: Simulated time has not started.
+        """
         advanced = self._advance()
         if advanced is None:
             raise MessageError(NO_CLOCK)
@@ -161,9 +166,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _publish_start(self, robot: Robot) -> None:
         """Publish the pose and the time at which the odometry starts."""
-        frame = self.parameters.odom_frame_id
-        data = self._serialized_start(robot.stamp, frame, robot.pose_tuple, robot.covariance_tuple)
-        self._start_pose.publish(data)
+        place = Place(robot.stamp, self._frame, robot.pose_tuple, robot.covariance_tuple)
+        self._start_pose.publish(self._serialized_start(place))
 
     def _on_tick(self) -> None:
         advanced = self._advance()
@@ -174,23 +178,21 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             self._first_clock = None
         now, robot = advanced
         truth = robot.at(now)
-        state = truth if self.defects.encoders is None else self.defects.reported(truth)
-        parameters = self.parameters
-        data = self._serialized_odometry(
+        state = self.defects.reported(truth)
+        odometry = Motion(
             now,
-            parameters.odom_frame_id,
+            self._frame,
             state.pose_tuple,
             state.twist,
             state.covariance_tuple,
             state.twist_covariance_tuple(self._period),
         )
-        self._odom.publish(data)
+        self._odom.publish(self._serialized_odometry(odometry))
         wheels = Wheels.of(now, self._wheel_names, state.wheel_speeds, state.wheel_angles)
-        self._joint_states.publish(self._serialized_joints(*wheels))
+        self._joint_states.publish(self._serialized_joints(wheels))
         if self._ground_truth is not None:
-            frame = parameters.ground_truth_frame_id
-            data = self._serialized_truth(now, frame, truth.true_pose_tuple, truth.true_twist)
-            self._ground_truth.publish(data)
+            motion = Motion(now, self._truth_frame, truth.true_pose_tuple, truth.true_twist)
+            self._ground_truth.publish(self._serialized_truth(motion))
         if self._transforms is not None:
             messages.set_time(self._odometry.header.stamp, now)
             messages.set_pose(self._odometry.pose.pose, state.pose)
@@ -198,66 +200,60 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     # --- Commands
 
-    def _read_joint_command(self, *fields: Any) -> Command:
-        wheels = JOINT_STATE.value(*fields)
-        speeds = wheels.speeds(self.parameters.wheel_names)
+    def _on_wheels(self, wheels: Wheels) -> None:
+        """Apply wheel speeds as the twist that they mean."""
+        speeds = wheels.speeds(self._wheel_names)
         # Not later: the twist of such speeds is zero.
         self.warn_of_integers('a command on joint_command', *speeds)
         v, omega = self._model.twist(*speeds)
-        return Command(messages.plausible_twist(v, omega), wheels.stamp)
+        self._on_command(Command(plausible_twist(v, omega), wheels.stamp))
 
-    def _apply(self, read: Callable[..., Command], *fields: Any) -> None:
-        """Apply the command that `read` returns for the fields, or log why it is dropped."""
-        try:
-            now, robot = self._present()
-            twist, stamp = read(*fields)
-            timeout = robot.model.command_timeout
-            time = command_time(stamp, now, robot.stamp, timeout) if stamp else now
-        except MessageError as error:
-            self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
-            return
-        v, omega = twist
+    def _on_command(self, command: Command) -> None:
+        """Apply a command at its stamp, or now if it has none."""
+        now, robot = self.present()
+        (v, omega), stamp = command
+        time = command_time(stamp, now, robot.stamp, robot.model.command_timeout) if stamp else now
         if v or omega:
             self._commands.count()
             # Not a call for each message.
             if min(abs(v) or 1.0, abs(omega) or 1.0) < SMALLEST:
                 self.warn_of_integers('a command', v, omega)
-        self._robot = robot.commanded(twist, time)
+        self._robot = robot.commanded((v, omega), time)
         self._publish_applied(self._robot)
 
     def _publish_applied(self, robot: Robot) -> None:
         """Publish the twist that the robot is to reach, with the time from which it follows it."""
-        self._applied.publish(self._serialized_command(robot.target, robot.stamp))
+        self._applied.publish(self._serialized_command(Command(robot.target, robot.stamp)))
 
     # --- Pose
 
-    def _on_initial_pose(self, sec: int, nanosec: int, frame: str, *values: Any) -> None:
-        ours = self.parameters.odom_frame_id
-        self.warn_of_integers('initialpose', *values[:6])
-        try:
-            now, robot = self._present()
-            if frame not in ('', ours):
-                raise MessageError(f"its frame must be '{printable(ours)}', got '{printable(frame)}'")
-            # Its stamp does not matter: the robot is placed when the message is received.
-            place = POSE_WITH_COVARIANCE.value(0, 0, frame, *values)
-            pose, covariance = np.array(place.pose), from_covariance(place.covariance)
-        except MessageError as error:
-            self.get_logger().warning(f'initialpose dropped: {error}', throttle_duration_sec=THROTTLE)
-            return
-        self._place(robot.placed(pose, covariance, now))
+    def _on_initial_pose(self, place: Place) -> None:
+        """Place the robot now: the stamp does not matter."""
+        now, robot = self.present()
+        if place.frame not in ('', self._frame):
+            raise MessageError(
+                f"its frame must be '{printable(self._frame)}', got '{printable(place.frame)}'"
+            )
+        self.warn_of_integers('initialpose', *place.pose)
+        covariance = from_covariance(place.covariance)
+        self.place(robot.placed(np.array(place.pose), covariance, now))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
-            now, robot = self._present()
+            now, robot = self.present()
         except MessageError as error:
             response.message = str(error)
             return response
-        self._place(robot.placed(self._initial_pose(), np.zeros((3, 3)), now, odometry_only=True))
+        self.place(robot.placed(self._initial_pose(), np.zeros((3, 3)), now, odometry_only=True))
         response.success, response.message = True, f'odometry was reset to {self._initial_pose()}'
         return response
 
-    def _place(self, robot: Robot) -> None:
-        """Replace the robot, whose odometry starts again at its pose."""
+    def follow(self, robot: Robot) -> None:
+        """Go on with another robot, of which the odometry notices nothing."""
+        self._robot = robot
+
+    def place(self, robot: Robot) -> None:
+        """Go on with another robot, whose odometry starts again at its pose."""
         self._robot = robot
         self.defects.placed(robot)
         self._publish_start(robot)
@@ -290,10 +286,10 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._configure()
         if parameters.publish_rate != previous.publish_rate:
             change_timer_period(self._timer, nanoseconds(1.0 / parameters.publish_rate))
-        self._remodel()
+        self.remodel()
 
-    def _remodel(self) -> None:
-        """Continue with the model of the present parameters and defects."""
+    def remodel(self) -> None:
+        """Go on with the model of the present parameters and defects."""
         advanced = self._advance()
         model = self.defects.model(self._model)
         if model.drift is not None and self._ground_truth is None:
@@ -316,11 +312,12 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         parameters = self.parameters
         self._model = parameters.model()
         self._period = 1.0 / parameters.publish_rate
+        self._frame, self._truth_frame = parameters.odom_frame_id, parameters.ground_truth_frame_id
         self._odometry = Odometry(child_frame_id=parameters.base_frame_id)
         truth = Odometry(child_frame_id=parameters.base_frame_id)
-        truth.header.frame_id = parameters.ground_truth_frame_id
+        truth.header.frame_id = self._truth_frame
         start, command = PoseWithCovarianceStamped(), TwistStamped()
-        self._odometry.header.frame_id = start.header.frame_id = parameters.odom_frame_id
+        self._odometry.header.frame_id = start.header.frame_id = self._frame
         command.header.frame_id = parameters.base_frame_id
         self._wheel_names = parameters.wheel_names
         joints = JointState(name=[*self._wheel_names], position=[0.0, 0.0], velocity=[0.0, 0.0])
@@ -346,107 +343,3 @@ def transform_of(odometry: Odometry) -> TransformStamped:
     translation.x, translation.y = position.x, position.y
     message.transform.rotation = odometry.pose.pose.orientation
     return message
-
-
-class RobotDefects:
-    """What is wrong with a virtual robot beyond its parameters, for tests: changes of its model, coarse
-    encoders, and pushes.
-
-    From the first one on after which the true pose may differ from the odometry, the model has a drift,
-    and the robot publishes `ground_truth`.
-    """
-
-    def __init__(self, node: VirtualRobot) -> None:
-        """Start with a robot that is in order."""
-        self._node = node
-        self._changes: list[Callable[[RobotModel], RobotModel]] = []
-        self.encoders: Encoders | None = None
-        """The encoders at their last reading; None: the angles are exact."""
-        self._has_truth = False
-
-    def model(self, nominal: RobotModel) -> RobotModel:
-        """Return the model of the robot, given that of its parameters."""
-        for change in self._changes:
-            nominal = change(nominal)
-        if nominal.drift is not None:
-            self._has_truth = True
-        elif self._has_truth:
-            # The true pose is not forgotten.
-            return replace(nominal, drift=Drift())
-        return nominal
-
-    def change(self, change: Callable[[RobotModel], RobotModel]) -> Callable[[], None]:
-        """Change the model from now on, and return a function that ends the change.
-
-        Several changes apply in the order of the calls.
-        """
-        self._changes.append(change)
-        self._node._remodel()
-
-        def end() -> None:
-            self._changes.remove(change)
-            self._node._remodel()
-
-        return end
-
-    def push(self, displacement: ArrayLike, *, noticed: bool = False) -> None:
-        """Displace the robot now, without turning its wheels.
-
-        Args:
-            displacement: `[dx, dy, dtheta]` in the body frame, shape (3,) (m, m, rad).
-            noticed: Whether the odometry follows, as if corrected by a localisation.
-
-        Raises:
-            ValueError: The displacement is invalid.
-            MessageError: Simulated time has not started.
-        """
-        if not noticed:
-            self._know_truth()
-        now, robot = self._node._present()
-        pushed = robot.pushed(displacement, now, noticed=noticed)
-        if noticed:
-            self._node._place(pushed)
-        else:
-            self._node._robot = pushed
-
-    # --- Encoders
-
-    def set_encoders(self, per_revolution: int | None) -> None:
-        """Report what encoders of so many increments per turn of a wheel count; None: exact angles.
-
-        The odometry goes on from its present pose.
-
-        Raises:
-            ValueError: It is not a positive integer.
-            MessageError: Simulated time has not started.
-        """
-        self._know_truth()
-        now, robot = self._node._present()
-        encoders, robot = self.encoders, robot.at(now)
-        if per_revolution is not None:
-            self.encoders = Encoders.at(robot, per_revolution)
-        elif encoders is not None:
-            self.encoders = None
-            pose = encoders.read(robot).pose
-            self._node._place(robot.placed(pose, robot.covariance, now, odometry_only=True))
-
-    def reported(self, robot: Robot) -> Robot:
-        """Read the encoders, and return the robot as they report it."""
-        if self.encoders is None:
-            return robot
-        self.encoders = self.encoders.read(robot)
-        return self.encoders.reported(robot)
-
-    def odometry_pose(self, robot: Robot) -> NDArray[np.float64]:
-        """Return `[x, y, theta]` of the odometry, shape (3,), by the last reading of encoders."""
-        return np.array(robot.pose_tuple if self.encoders is None else self.encoders.pose)
-
-    def placed(self, robot: Robot) -> None:
-        """Start the odometry again at the pose of the robot."""
-        if self.encoders is not None:
-            self.encoders = self.encoders.read(robot).placed(robot.pose_tuple)
-
-    def _know_truth(self) -> None:
-        """Compute the true pose besides that of the odometry from now on."""
-        self._has_truth = True
-        self._node._remodel()

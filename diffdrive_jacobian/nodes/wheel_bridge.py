@@ -14,16 +14,17 @@ from diffdrive_jacobian.messages.codecs import (
     TWIST,
     TWIST_STAMPED,
     WHEEL_ARRAY,
+    Command,
     WheelArray,
     Wheels,
 )
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.topics import UNREAD
+from diffdrive_jacobian.messages.topic_faults import UNREAD
 from diffdrive_jacobian.nodes.same_wheels import SameWheels
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
 from diffdrive_jacobian.parameters.wheels import SAME_WHEELS
 from diffdrive_jacobian.ros.graph_faults import topic_check
-from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
+from diffdrive_jacobian.ros.node import NO_CLOCK, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import restart_timer
 from diffdrive_jacobian.ros.serialization import Interleaving
 from diffdrive_jacobian.ros.watchdog import Watchdog, command_time
@@ -62,8 +63,15 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         )
         self._commands = Interleaving()
         stamped = parameters.enable_stamped_cmd_vel
-        kind, self._codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
-        self.subscribe(kind, 'cmd_vel', self._on_command, codec=self._codec, numbers=self._commands)
+        kind, codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
+        self.subscribe(
+            kind,
+            'cmd_vel',
+            self._on_command,
+            codec=codec,
+            called='command',
+            numbers=self._commands,
+        )
         readers = self._joint_command.get_subscription_count
         self.watch(topic_check(self, UNREAD, 'joint_command', readers))
         self._last = 0
@@ -75,18 +83,14 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         self._watchdog.start(self._timeout)
         self.announce(subscribed=['cmd_vel'], publishing=['joint_command'])
 
-    def _on_command(self, *fields: Any) -> None:
+    def _on_command(self, command: Command) -> None:
         now = self.now()
+        if now == 0:
+            raise MessageError(NO_CLOCK)
+        (v, omega), stamp = command
         # The time of the last command is meaningless after time went back.
         last = self._last if self._last <= now else 0
-        try:
-            if now == 0:
-                raise MessageError(NO_CLOCK)
-            (v, omega), stamp = self._codec.value(*fields)
-            self._last = command_time(stamp, now, last, self._timeout)
-        except MessageError as error:
-            self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
-            return
+        self._last = command_time(stamp, now, last, self._timeout)
         self._watchdog.feed(now)
         if self._same_wheels is not None and self._same_wheels.advance():
             self._same_wheels = None
@@ -169,7 +173,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         speeds, names = [0.0, 0.0], parameters.wheel_names
         if self._joint_command.msg_type is JointState:
             joints = JOINT_STATE.writer(JointState(name=[*names], velocity=speeds))
-            self._serialized = lambda speeds, stamp: joints(*Wheels.of(stamp, names, speeds))
+            self._serialized = lambda speeds, stamp: joints(Wheels.of(stamp, names, speeds))
         else:
             array = WHEEL_ARRAY.writer(Float64MultiArray(data=speeds))
-            self._serialized = lambda speeds, _: array(*WheelArray.of(speeds))
+            self._serialized = lambda speeds, _: array(WheelArray.of(speeds))

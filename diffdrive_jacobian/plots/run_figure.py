@@ -25,7 +25,6 @@ from diffdrive_jacobian.bags.timeline import (
     timeline,
     tolerance,
 )
-from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension
 from diffdrive_jacobian.plots.rendering import render, styled
 from diffdrive_jacobian.plots.uncertainty import distance_travelled, draw_uncertainty, uncertainty_marks
@@ -68,7 +67,7 @@ LATE = 0.1
 """Lateness of a trajectory from which on it is drawn (s)."""
 NAMED, FAULT_LABEL = 6, 60
 """Number of faults that the legend names, and length beyond which a name is cut."""
-_FIXED = {
+LABELS = {
     'distance': 'distance to goal [m]',
     'bearing_error': 'bearing error [rad]',
     'across': 'across path [m]',
@@ -79,10 +78,6 @@ _FIXED = {
     'omega': r'yaw rate $\omega$ [rad/s]',
     'right': r'right wheel $\omega_R$ [rad/s]',
     'left': r'left wheel $\omega_L$ [rad/s]',
-}
-LABELS = {
-    **_FIXED,
-    **{name: f'{name} [{unit}]' for topic in SENSORS for name, unit in topic.readings.items()},
 }
 """Quantities over time, and the labels of their axes."""
 _ARROW: Any = {
@@ -181,12 +176,6 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
         *_path_quantities(timelines),
         *('v', 'omega'),
         *(('right', 'left') if any(len(run.wheels) + len(run.wheel_commands) for run in runs) else ()),
-        *(
-            column
-            for topic in SENSORS
-            if any(len(getattr(run, topic.series)) for run in runs)
-            for column in topic.columns
-        ),
     ]
     columns = 1 if len(quantities) == 2 else 2
     rows = -(-len(quantities) // columns)

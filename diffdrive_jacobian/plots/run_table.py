@@ -12,22 +12,17 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.bags.timeline import Timeline, seconds, timeline
-from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.plots.output_files import create
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 __all__ = ['COLUMNS', 'table', 'write_csv']
 
-_FIXED = (
+COLUMNS = (
     *('time_s', 'x_m', 'y_m', 'theta_rad', 'v_mps', 'omega_radps'),
     *('distance_m', 'bearing_error_rad', 'v_command_mps', 'omega_command_radps'),
     *('omega_right_radps', 'omega_left_radps', 'goal_heading_error_rad', 'beyond_goal_m'),
     *('path_progress_m', 'along_path_m', 'across_path_m', 'path_heading_error_rad'),
     'late_s',
-)
-COLUMNS = (
-    *_FIXED,
-    *(f'{name}_{unit}' for topic in SENSORS for name, unit in topic.readings.items()),
 )
 """Columns of the table, with their units."""
 DECIMALS = 9
@@ -39,9 +34,9 @@ def table(run: Run) -> NDArray[np.float64]:
 
     Time counts from the first odometry message. The command is the latest one at that time: as applied
     (`cmd_vel_out`), or as sent (`cmd_vel`) if that was not recorded. Wheel speeds are interpolated
-    linearly between the messages of `joint_states`. Of other sensors it is the latest value. Beyond the
-    goal is along the line from where the robot was when it began to drive there, negative before it: the
-    largest value is the overshoot. Unknown values are NaN.
+    linearly between the messages of `joint_states`. Beyond the goal is along the line from where the
+    robot was when it began to drive there, negative before it: the largest value is the overshoot.
+    Unknown values are NaN.
 
     Raises:
         BagError: There is no odometry.
@@ -59,7 +54,6 @@ def table(run: Run) -> NDArray[np.float64]:
             one.goal_heading_error,
             _beyond_goal(one),
             *(one.progress, one.along, one.across, one.path_heading_error, one.late),
-            *(_latest(one, getattr(run, topic.series)) for topic in SENSORS),
         ]
     )
 

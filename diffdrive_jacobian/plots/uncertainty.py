@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from diffdrive_jacobian.bags.timeline import Array, Indices, Timeline
-from diffdrive_jacobian.messages.topics import TOPICS
+from diffdrive_jacobian.messages.topics import OF_POSE
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
 from diffdrive_jacobian.simulation.pose_region import (
     ELLIPSE_LEVEL,
@@ -117,7 +117,7 @@ def _of_wheels(covariances: Array, breaks: Indices) -> bool:
     """Return whether covariances are valid and grow as those of wheels do."""
     if not np.isfinite(covariances).all():
         return False
-    growth = np.diff(covariances[:, TOPICS['odom'].covariances.index('tt')])
+    growth = np.diff(covariances[:, OF_POSE.index('tt')])
     growth[breaks - 1] = 0.0
     if not (np.all(growth >= 0.0) and np.any(growth > 0.0) and np.any(covariances[:, 8] > 0.0)):
         return False

@@ -71,7 +71,8 @@ def field_reader(fields_of: Callable[[type], tuple[str, ...]]) -> Read:
     @lru_cache(1)
     def read_bytes(message_type: type, message: bytes) -> tuple[Any, ...] | None:
         with suppress(DecodingError):
-            return compiled(message_type)[1](message)
+            fields: tuple[Any, ...] = compiled(message_type)[1](message)
+            return fields
         return None
 
     def read(message_type: type, message: Any) -> tuple[Any, ...] | None:

@@ -17,7 +17,8 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from diffdrive_jacobian.messages.names import node_of, type_name
-from diffdrive_jacobian.messages.topics import ALTERNATING, TOPICS, TopicFault
+from diffdrive_jacobian.messages.topic_faults import ALTERNATING, TopicFault
+from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.ros.rclpy_internals import graph_changed
 from diffdrive_jacobian.ros.serialization import Interleaving
 from diffdrive_jacobian.text import printable

@@ -25,8 +25,9 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 
-from diffdrive_jacobian.messages.cdr import SMALLEST, DecodingError, integer_warning
+from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import Codec
+from diffdrive_jacobian.messages.conversion import MessageError, integer_warning
 from diffdrive_jacobian.messages.names import type_name
 from diffdrive_jacobian.parameters.declaration import (
     NodeParameters,
@@ -48,10 +49,11 @@ from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.parameters import declare, declare_new
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.rclpy_internals import log_info, parameter_overrides, reason, time_reader
-from diffdrive_jacobian.ros.serialization import Interleaving, decoding
+from diffdrive_jacobian.ros.serialization import Interleaving, receiver
 from diffdrive_jacobian.text import printable
 
 P = TypeVar('P', bound=NodeParameters)
+V = TypeVar('V')
 
 EVENT_BURST = 10
 """Number of log lines about one kind of event that are written without a delay."""
@@ -136,41 +138,46 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         self,
         message: type,
         topic: str,
-        callback: Callable[..., None],
+        callback: Callable[[V], None],
         *,
-        codec: Codec[Any] | None = None,
+        codec: Codec[V],
+        called: str = '',
+        refused: Callable[[MessageError], None] | None = None,
         numbers: Interleaving | None = None,
     ) -> Subscription:
         """Create a subscription with reliable QoS, keep last 10.
 
-        Bytes that are not a message of the type are logged and dropped.
+        What is no message of the type, and what is refused, is logged and dropped.
 
         Args:
             message: Type of the messages.
             topic: Name of the topic.
-            callback: Called with the fields of each message that the codec reads, one argument each. Its
-                `value` checks them.
-            codec: What is read of the messages. None: the callback receives the serialized bytes.
+            callback: Called with the value of each message. It refuses one by a MessageError.
+            codec: What is read of the messages.
+            called: What the log calls a message that is refused; '': as the topic.
+            refused: Receives why a message is refused, instead of the log.
             numbers: Receives the sequence number of each message before the callback is called, which
-                counts those that must not alternate with those of others. It needs a codec.
+                counts those that must not alternate with those of others.
 
         Raises:
             ParameterError: As for `advertise`.
         """
 
-        def dropped(error: DecodingError) -> None:
-            self.get_logger().warning(f'{topic} dropped: {error}', throttle_duration_sec=THROTTLE)
+        def dropped(error: MessageError) -> None:
+            if refused is not None and not isinstance(error, DecodingError):
+                refused(error)
+                return
+            what = topic if isinstance(error, DecodingError) else called or topic
+            self.get_logger().warning(f'{what} dropped: {error}', throttle_duration_sec=THROTTLE)
 
         self.watch(wrong_type(self, topic, message, subscribed=True), TYPE_PATIENCE, error=True)
-        if codec is not None:
-            callback = decoding(message, codec.fields, callback, dropped, numbers)
         if numbers is not None:
             self.watch(alternating_commands(self, topic, numbers), ALTERNATION_PATIENCE)
         with explaining_failure(self, message, topic):
             return self.create_subscription(
                 message,
                 topic,
-                callback,
+                receiver(codec, message, callback, dropped, numbers),
                 QoSProfile(depth=10),
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
                 raw=True,
@@ -199,11 +206,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     def warn_of_integers(self, what: str, *values: float) -> None:
         """Warn, throttled, if a value of what is named is an integer assigned to a field of floats."""
-        for value in values:
-            if value and -SMALLEST < value < SMALLEST:
-                warning = integer_warning(what, value)
-                self.get_logger().warning(warning, throttle_duration_sec=THROTTLE)
-                return
+        if warning := integer_warning(what, *values):
+            self.get_logger().warning(warning, throttle_duration_sec=THROTTLE)
 
     def log_event_info(self, event: str, text: str) -> None:
         """Log a line at level info, of each kind of event EVENT_BURST, then one per EVENT_PERIOD."""

@@ -185,10 +185,7 @@ class Robot:
         """`[x, y, theta]`, shape (3,), read-only. `pose_tuple` has the same numbers without an array."""
         return read_only(self._state.pose)
 
-    @property
-    def pose_tuple(self) -> Pose:
-        """`(x, y, theta)`, the pose as floats (m, m, rad)."""
-        return self._state.pose
+    pose_tuple: Pose = _field('_state.pose', '`(x, y, theta)`, the pose as floats (m, m, rad).')
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -228,10 +225,7 @@ class Robot:
             raise ValueError('twist and time must give a finite result, but it overflows')
         return moments
 
-    @property
-    def wheel_angles(self) -> WheelSpeeds:
-        """`(right, left)`, unwrapped (rad)."""
-        return self._state.wheel_angles
+    wheel_angles: WheelSpeeds = _field('_state.wheel_angles', '`(right, left)`, unwrapped (rad).')
 
     @property
     def twist(self) -> Twist:

@@ -107,6 +107,7 @@ def executor() -> dict[str, float]:
 
     Here time passes by itself: only what is executed in callbacks is counted.
     """
+    from diffdrive_jacobian.messages.codecs import Route
     from diffdrive_jacobian.ros.runner import make_executor, ros_context
 
     with ros_context(['counts', *QUIET], default=True) as context:
@@ -115,7 +116,7 @@ def executor() -> dict[str, float]:
         for node in (robot, controller):
             spinner.add_node(node)
         # As if a client had sent it.
-        controller._on_goal_pose(0, 0, '', 5e5, 5e5, 0.0, 0.0, 0.0, 1.0)
+        controller._on_pose(Route((0, 0), '', ((5e5, 5e5, 0.0),)))
         ticks, tick = 0, robot._timer.callback
 
         def counting() -> None:

@@ -44,8 +44,5 @@ export function showStatus(model, open) {
   setText(byId('state'), badge);
   byId('state').className = `badge ${kind}`;
   setText(byId('summary'), sentence);
-  const known = robot.readings.filter(([, value]) => value !== null);
-  byId('readings').hidden = !known.length;
-  setText(byId('readings'), known.map(([name, value, unit]) => `${name} ${format(value)} ${unit}`).join(', '));
   byId('cancel').disabled = !robot.goal.active;
 }
