@@ -27,7 +27,7 @@ from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
 from diffdrive_jacobian.numerics.elementary import wrap
-from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
+from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.virtual_robot import MULTIPLIERS, VirtualRobotParameters
 from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
@@ -408,7 +408,7 @@ def _stood_since(run: Run, index: int) -> bool:
 def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, list[list[_Anchor]]]:
     """Return the robot after each `cmd_vel`, or `joint_command` if it is driven by its wheels."""
     values = dict(given if given is not None else run.of_node(ROBOT))
-    parameters = from_ros(VirtualRobotParameters, values)
+    parameters = VirtualRobotParameters().changed(values)
     source, series = 'cmd_vel', run.cmd_vel
     if parameters.command_interface == 'wheels':
         source, series = 'joint_command', run.wheel_commands
@@ -440,7 +440,7 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
             continue
         if isinstance(event, dict):
             values.update(event)
-            parameters = from_ros(VirtualRobotParameters, values)
+            parameters = VirtualRobotParameters().changed(values)
             robot = robot.remodelled(
                 parameters.model(), received, wheels_commanded=source == 'joint_command'
             )
@@ -476,7 +476,7 @@ def recorded_model(run: Run) -> RobotModel | None:
     if changed & {*_NOISE_PARAMETERS, *MULTIPLIERS} or not (separation > 0.0 and variance >= 0.0):
         return None
     try:
-        drift = from_ros(VirtualRobotParameters, recorded).drift()
+        drift = VirtualRobotParameters().changed(recorded).drift()
     except ParameterError:
         drift = None
     return RobotModel(wheel_separation=separation, wheel_travel_variance=variance, drift=drift)
@@ -538,7 +538,7 @@ def recorded_dynamics(run: Run) -> list[RobotModel]:
 def _dynamics(values: Mapping[str, Any], faults: Iterable[str]) -> RobotModel:
     """Return a model from the parameters of a robot and the faults of its motors."""
     try:
-        model = from_ros(VirtualRobotParameters, values).model()
+        model = VirtualRobotParameters().changed(values).model()
         actuators = model.actuators
         for fault in faults:
             for pattern, change in _MOTOR_FAULTS:

@@ -31,7 +31,7 @@ from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import (
     Checked,
     Finite,
-    between,
+    Range,
     function,
     numbers,
     optional,
@@ -99,13 +99,18 @@ class Gain(Checked):
         self.check(last)
         object.__setattr__(self, 'usual', (first, last))
 
+    @property
+    def range(self) -> Range:
+        """The values allowed."""
+        return Range(*self.bounds, self.above)
+
     def shares_range(self, other: Gain) -> bool:
         """Return whether a gain of the same name allows the same values, so that it can be shared."""
         return (self.unit, self.bounds, self.above) == (other.unit, other.bounds, other.above)
 
     def check(self, value: float) -> None:
         """Raise ValueError if a value is not allowed."""
-        between(*self.bounds, above=self.above)(self.name, value)
+        self.range(self.name, value)
 
 
 KP = Gain(

@@ -39,7 +39,7 @@ from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError, 
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.remote_goal import ignores_heading
 from diffdrive_jacobian.nodes.stopping import rolls_on
-from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
+from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 from diffdrive_jacobian.ros.service_client import ServiceClient, ignore
@@ -345,7 +345,7 @@ class LiveRobot:
     def _rolls_on(self) -> str:
         """Describe how far the robot rolls after zero was sent, as far as its limits are known."""
         try:
-            model = from_ros(VirtualRobotParameters, self.state.robot_values).model()
+            model = VirtualRobotParameters().changed(self.state.robot_values).model()
         except ParameterError:
             # The robot is another node, with parameters of the same names.
             return ''

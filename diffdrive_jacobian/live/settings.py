@@ -13,7 +13,6 @@ from typing import Any, Literal
 from diffdrive_jacobian.control import ControllerError, Gain, controller_names, find_controller
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.live.quantities import rounded
-from diffdrive_jacobian.parameters.declaration import specifications
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.text import printable
@@ -109,10 +108,10 @@ _OFFERED = (
             high=0.002, hint='Variance per distance: how fast the uncertainty region grows'),
 )  # fmt: skip
 _DECLARED = {
-    'controller': specifications(GoToGoalParameters),
-    'robot': specifications(VirtualRobotParameters),
+    'controller': GoToGoalParameters().declared(),
+    'robot': VirtualRobotParameters().declared(),
 }
-SETTINGS = [replace(one, declared=_DECLARED[one.role][one.name][1].range) for one in _OFFERED]
+SETTINGS = [replace(one, declared=_DECLARED[one.role][one.name].limits) for one in _OFFERED]
 """What the page offers besides the gains. A node is asked for those that it has."""
 
 
@@ -130,7 +129,7 @@ def recorded_gains(values: Mapping[str, Any]) -> tuple[Gain, ...]:
 
     Their descriptions and ranges are in the package of the controller, which may be missing here.
     """
-    own = specifications(GoToGoalParameters)
+    own = _DECLARED['controller']
     found = []
     for name, value in values.items():
         if name not in own and isinstance(value, float):

@@ -93,12 +93,12 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 has the name of a built-in one.
             ParameterError: The parameters given are not a valid set.
         """
-        parameters = GoToGoalParameters
+        defaults = GoToGoalParameters()
         if controller is not None:
-            parameters = parameters.with_controller(controller)
+            defaults = defaults.with_controller(controller)
         if path_controller is not None:
-            parameters = parameters.with_path_controller(path_controller)
-        super().__init__('go_to_goal', parameters, **kwargs)
+            defaults = defaults.with_path_controller(path_controller)
+        super().__init__('go_to_goal', defaults, **kwargs)
         self._goal: ActiveGoal | None = None
         self._goals_received = 0
         self._state = State('', (0.0, 0.0, 0.0), STANDSTILL)

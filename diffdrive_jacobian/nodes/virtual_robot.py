@@ -69,7 +69,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def __init__(self, **kwargs: Any) -> None:
         """Create the robot at its initial pose. `kwargs` as for `ParameterizedNode`."""
-        super().__init__('virtual_robot', VirtualRobotParameters, **kwargs)
+        super().__init__('virtual_robot', VirtualRobotParameters(), **kwargs)
         self._robot: Robot | None = None
         """The robot at the last event. None: simulated time has not started."""
         self._latest = 0

@@ -48,7 +48,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
 
     def __init__(self, **kwargs: Any) -> None:
         """Create the bridge. `kwargs` as for `ParameterizedNode`."""
-        super().__init__('wheel_bridge', WheelBridgeParameters, **kwargs)
+        super().__init__('wheel_bridge', WheelBridgeParameters(), **kwargs)
         parameters = self.parameters
         as_joints = parameters.joint_command_type == 'JointState'
         self._joint_command = self.advertise(

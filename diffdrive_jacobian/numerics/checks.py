@@ -21,6 +21,7 @@ import math
 import operator
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import cache, partial
 from numbers import Integral, Real
 from types import NoneType, UnionType
@@ -232,9 +233,47 @@ def _float(name: str, value: Any) -> float:
         raise ValueError(f'{name} must be finite, got {short(value)}') from None
 
 
-def between(
-    low: float, high: float = math.inf, *, above: float | None = None, unit: str = ''
-) -> Callable[[str, Any], float]:
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Finite numbers between limits: a check of a single number, and the numbers themselves."""
+
+    low: float
+    """Smallest number."""
+    high: float = math.inf
+    """Largest number; infinity: all finite ones."""
+    above: float | None = None
+    """Lower limit that is itself not allowed, besides `low`."""
+    unit: str = ''
+    """Unit, for messages."""
+
+    def __call__(self, name: str, value: Any) -> float:
+        """Require a single number of the range."""
+        result = _float(name, value)
+        if result not in self:
+            raise ValueError(f'{name} must be {self}, got {short(value)}')
+        return result
+
+    def __contains__(self, value: float) -> bool:
+        """Return whether a number is in the range; NaN is not."""
+        return (
+            self.low <= value <= self.high
+            and value < math.inf
+            and (self.above is None or value > self.above)
+        )
+
+    def __str__(self) -> str:
+        """Return the range in words."""
+        above = None if self.above is None or self.above < self.low else self.above
+        ends = self.low if above is None else above, self.high
+        first, last = (str(end) if isinstance(end, int) else f'{end:g}' for end in ends)
+        if self.high == math.inf:
+            words = f'finite and {"at least" if above is None else "above"} {first}'
+        else:
+            words = f'in {"[" if above is None else "("}{first}, {last}]'
+        return f'{words} {self.unit}'.strip()
+
+
+def between(low: float, high: float = math.inf, *, above: float | None = None, unit: str = '') -> Range:
     """Return a check that requires a single finite number in a range.
 
     Args:
@@ -243,31 +282,7 @@ def between(
         above: Lower bound that is itself not allowed, besides `low`.
         unit: Unit, for messages.
     """
-
-    def check(name: str, value: Any) -> float:
-        result = _float(name, value)
-        if not inside(result, low, high, above):
-            allowed = f'{interval(low, high, above)} {unit}'.strip()
-            raise ValueError(f'{name} must be {allowed}, got {short(value)}')
-        return result
-
-    return check
-
-
-def inside(value: Any, low: float, high: float, above: float | None = None) -> bool:
-    """Return whether a number is in the range of `between`."""
-    return low <= value <= high and value < math.inf and (above is None or value > above)
-
-
-def interval(low: float, high: float, above: float | None = None) -> str:
-    """Return the range of `between` in words."""
-    if above is not None and above < low:
-        above = None
-    ends = low if above is None else above, high
-    first, last = (str(end) if isinstance(end, int) else f'{end:g}' for end in ends)
-    if high == math.inf:
-        return f'finite and {"at least" if above is None else "above"} {first}'
-    return f'in {"[" if above is None else "("}{first}, {last}]'
+    return Range(low, high, above, unit)
 
 
 # --- Arrays

@@ -8,56 +8,26 @@ from typing import Any
 
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
+from diffdrive_jacobian.numerics.checks import Range, between
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, parameter
 from diffdrive_jacobian.simulation.actuators import SHORTEST, AccelerationLimits, AxisLimits
 from diffdrive_jacobian.simulation.robot_model import RobotModel
 from diffdrive_jacobian.text import printable
 
-_GREATEST = 1e6
 _SMALLEST = 1e-200
-_RATES = {
-    'max_acceleration': (1.0, 'Maximum acceleration forward', 'no limits of the acceleration'),
-    'max_deceleration': (-1.0, 'Maximum deceleration of forward motion, negative', 'as in reverse'),
-    'max_acceleration_reverse': (
-        -1.0,
-        'Maximum acceleration in reverse, negative',
-        'minus max_acceleration',
-    ),
-    'max_deceleration_reverse': (
-        1.0,
-        'Maximum deceleration of motion in reverse, positive',
-        'max_acceleration',
-    ),
-}
-"""Sign, description and meaning of NaN of each limit of the acceleration."""
+SPEED = between(0.0, MAX_SPEED)
+REVERSE = between(-MAX_SPEED, 0.0)
+GAINING = between(1e-6, 1e6)
+LOSING = between(-1e6, -1e-6)
 
 
-def _velocity(name: str, text: str) -> Any:
-    bounds = (0.0, MAX_SPEED) if name.endswith('max_velocity') else (-MAX_SPEED, 0.0)
-    return parameter(math.nan, text, name=name, bounds=bounds, nan_is_none=True)
-
-
-def _acceleration(axis: str, name: str) -> Any:
-    sign, what, otherwise = _RATES[name]
-    unit = 'm/s^2'
-    if axis == 'angular.z':
-        unit = 'rad/s^2'
-        what = what.replace('forward motion', 'counter-clockwise turns')
-        what = what.replace('motion in reverse', 'clockwise turns')
-        what = what.replace('forward', 'counter-clockwise').replace('in reverse', 'clockwise')
-        otherwise = otherwise.replace('in reverse', 'clockwise')
-    return parameter(
-        math.nan,
-        f'{what} [{unit}]; .nan: {otherwise}.',
-        name=f'{axis}.{name}',
-        bounds=(1e-6, _GREATEST) if sign > 0.0 else (-_GREATEST, -1e-6),
-        nan_is_none=True,
-    )
+def _limited(name: str, within: Range, description: str) -> Any:
+    return parameter(math.nan, description, within, name=name, nan_is_none=True)
 
 
 def timeout_field(description: str) -> Any:
     """Declare the time without a message after which a node stops what it commands."""
-    return parameter(0.5, description, bounds=(0.0, 3600.0))
+    return parameter(0.5, description, between(0.0, 3600.0))
 
 
 def wheel_lag_field() -> Any:
@@ -65,7 +35,7 @@ def wheel_lag_field() -> Any:
     return parameter(
         0.0,
         'Time constant with which the wheels follow commands, of first order; 0 or at least 1e-9 [s].',
-        bounds=(0.0, 100.0),
+        between(0.0, 100.0),
     )
 
 
@@ -79,7 +49,16 @@ def check_wheel_lag(wheel_lag: float) -> None:
 
 def command_delay_field() -> Any:
     """Declare the delay of commands."""
-    return parameter(0.0, 'Time from a command to its effect on the wheels [s].', bounds=(0.0, 100.0))
+    return parameter(0.0, 'Time from a command to its effect on the wheels [s].', between(0.0, 100.0))
+
+
+_RATES = (
+    'max_acceleration',
+    'max_deceleration',
+    'max_acceleration_reverse',
+    'max_deceleration_reverse',
+)
+"""Limits of the acceleration of an axis."""
 
 
 def number_or(value: float, otherwise: float) -> float:
@@ -104,28 +83,64 @@ def differ(first: str, value: str, second: str, other: str) -> None:
 class TwistParameters(NodeParameters):
     """Type of cmd_vel, and limits of twist and acceleration."""
 
-    linear_x_max_velocity: float = _velocity(
-        'linear.x.max_velocity', 'Maximum forward velocity [m/s]; .nan: no limit.'
+    linear_x_max_velocity: float = _limited(
+        'linear.x.max_velocity', SPEED, 'Maximum forward velocity [m/s]; .nan: no limit.'
     )
-    linear_x_min_velocity: float = _velocity(
+    linear_x_min_velocity: float = _limited(
         'linear.x.min_velocity',
+        REVERSE,
         'Minimum velocity, zero or negative: the limit in reverse [m/s]; .nan: as forward.',
     )
-    angular_z_max_velocity: float = _velocity(
-        'angular.z.max_velocity', 'Maximum yaw rate, counter-clockwise [rad/s]; .nan: no limit.'
+    angular_z_max_velocity: float = _limited(
+        'angular.z.max_velocity',
+        SPEED,
+        'Maximum yaw rate, counter-clockwise [rad/s]; .nan: no limit.',
     )
-    angular_z_min_velocity: float = _velocity(
+    angular_z_min_velocity: float = _limited(
         'angular.z.min_velocity',
+        REVERSE,
         'Minimum yaw rate, zero or negative: the limit clockwise [rad/s]; .nan: as counter-clockwise.',
     )
-    linear_x_max_acceleration: float = _acceleration('linear.x', 'max_acceleration')
-    linear_x_max_deceleration: float = _acceleration('linear.x', 'max_deceleration')
-    linear_x_max_acceleration_reverse: float = _acceleration('linear.x', 'max_acceleration_reverse')
-    linear_x_max_deceleration_reverse: float = _acceleration('linear.x', 'max_deceleration_reverse')
-    angular_z_max_acceleration: float = _acceleration('angular.z', 'max_acceleration')
-    angular_z_max_deceleration: float = _acceleration('angular.z', 'max_deceleration')
-    angular_z_max_acceleration_reverse: float = _acceleration('angular.z', 'max_acceleration_reverse')
-    angular_z_max_deceleration_reverse: float = _acceleration('angular.z', 'max_deceleration_reverse')
+    linear_x_max_acceleration: float = _limited(
+        'linear.x.max_acceleration',
+        GAINING,
+        'Maximum acceleration forward [m/s^2]; .nan: no limits of the acceleration.',
+    )
+    linear_x_max_deceleration: float = _limited(
+        'linear.x.max_deceleration',
+        LOSING,
+        'Maximum deceleration of forward motion, negative [m/s^2]; .nan: as in reverse.',
+    )
+    linear_x_max_acceleration_reverse: float = _limited(
+        'linear.x.max_acceleration_reverse',
+        LOSING,
+        'Maximum acceleration in reverse, negative [m/s^2]; .nan: minus max_acceleration.',
+    )
+    linear_x_max_deceleration_reverse: float = _limited(
+        'linear.x.max_deceleration_reverse',
+        GAINING,
+        'Maximum deceleration of motion in reverse, positive [m/s^2]; .nan: max_acceleration.',
+    )
+    angular_z_max_acceleration: float = _limited(
+        'angular.z.max_acceleration',
+        GAINING,
+        'Maximum acceleration counter-clockwise [rad/s^2]; .nan: no limits of the acceleration.',
+    )
+    angular_z_max_deceleration: float = _limited(
+        'angular.z.max_deceleration',
+        LOSING,
+        'Maximum deceleration of counter-clockwise turns, negative [rad/s^2]; .nan: as clockwise.',
+    )
+    angular_z_max_acceleration_reverse: float = _limited(
+        'angular.z.max_acceleration_reverse',
+        LOSING,
+        'Maximum acceleration clockwise, negative [rad/s^2]; .nan: minus max_acceleration.',
+    )
+    angular_z_max_deceleration_reverse: float = _limited(
+        'angular.z.max_deceleration_reverse',
+        GAINING,
+        'Maximum deceleration of clockwise turns, positive [rad/s^2]; .nan: max_acceleration.',
+    )
     enable_stamped_cmd_vel: bool = parameter(
         False, 'Use TwistStamped instead of Twist for cmd_vel. Read-only.', read_only=True
     )
@@ -162,16 +177,16 @@ class TwistParameters(NodeParameters):
 
 
 def _multiplier(what: str) -> Any:
-    return parameter(1.0, f'Correction factor for the {what} [-].', bounds=(0.1, 10.0))
+    return parameter(1.0, f'Correction factor for the {what} [-].', between(0.1, 10.0))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class WheelParameters(TwistParameters):
     """Wheels and their joints, with the limits of their motion besides those of the twist."""
 
-    wheel_radius: float = parameter(0.033, 'Radius of the wheels [m].', bounds=(1e-3, 10.0))
+    wheel_radius: float = parameter(0.033, 'Radius of the wheels [m].', between(1e-3, 10.0))
     wheel_separation: float = parameter(
-        0.16, 'Distance between the left and the right wheel [m].', bounds=(1e-3, 100.0)
+        0.16, 'Distance between the left and the right wheel [m].', between(1e-3, 100.0)
     )
     wheel_separation_multiplier: float = _multiplier('wheel separation')
     left_wheel_radius_multiplier: float = _multiplier('radius of the left wheel')
@@ -179,13 +194,13 @@ class WheelParameters(TwistParameters):
     max_wheel_velocity: float = parameter(
         math.nan,
         'Maximum wheel speed [rad/s]; both are scaled alike, which keeps the curvature; .nan: no limit.',
-        bounds=(1e-3, 1e6),
+        between(1e-3, 1e6),
         nan_is_none=True,
     )
     max_wheel_acceleration: float = parameter(
         math.nan,
         'Maximum angular acceleration of a wheel [rad/s^2]; .nan: no limit.',
-        bounds=(1e-6, 1e9),
+        between(1e-6, 1e9),
         nan_is_none=True,
     )
     left_wheel_name: str = parameter('left_wheel_joint', 'Name of the joint of the left wheel.')

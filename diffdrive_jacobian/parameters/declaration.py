@@ -2,7 +2,7 @@
 
     @dataclass(frozen=True, kw_only=True, slots=True)
     class Parameters(NodeParameters):
-        kp: float = parameter(3.0, 'Gain on the heading error [1/s].', above=0.0)
+        kp: float = parameter(3.0, 'Gain on the heading error [1/s].', between(0.0, 100.0, above=0.0))
 
 The dataclass defines name, type, default, description, unit and range of each parameter. The descriptors
 that `ros2 param describe` shows are derived from it. It validates its values when it is created. A
@@ -14,16 +14,22 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, TypeVar
 
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.numerics import checks
+from diffdrive_jacobian.numerics.checks import Range, choices
 from diffdrive_jacobian.text import printable
 
 MAX_LENGTH = 256
 """Largest length of a string parameter (characters)."""
-NOT_EMPTY = f'not empty and at most {MAX_LENGTH} characters'
+_TYPE_NAMES = {
+    bool: 'a bool (true or false)',
+    int: 'an integer',
+    float: 'a double (as 1.0)',
+    str: 'a string',
+}
 
 
 class ParameterError(DiffdriveError, ValueError):
@@ -31,82 +37,86 @@ class ParameterError(DiffdriveError, ValueError):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Specification:
-    """Properties of a parameter other than its type and its default."""
+class Parameter:
+    """A parameter of a node."""
 
+    name: str
+    """ROS name, such as `linear.x.max_velocity`."""
+    field: str
+    """Name of its field, or of the attribute with its value."""
+    default: Any
+    """Default value; bool, int, float or str, which is its type."""
     description: str
     """One sentence with the unit in brackets."""
-    name: str | None = None
-    """ROS name, if it differs from the name of the field (`linear.x.max_velocity`)."""
-    low: float | None = None
-    """Smallest value allowed."""
-    high: float | None = None
-    """Largest value allowed."""
-    above: float | None = None
-    """Lower bound that is itself not allowed."""
+    within: Range | None = None
+    """The numbers allowed; None: all."""
     choices: Collection[str] = ()
-    """The strings allowed."""
+    """The strings allowed; empty: all up to MAX_LENGTH."""
     constraint: str = ''
     """Text for the descriptor instead of the list of choices, where these are searched for."""
     nan_is_none: bool = False
     """Whether NaN is allowed and means "none". Ranges of ROS reject NaN, so its descriptor has none."""
     read_only: bool = False
-    """Whether the parameter cannot change while the node runs."""
+    """Whether it cannot change while the node runs."""
 
     @property
     def allowed(self) -> str:
         """The values allowed, in words."""
-        words = []
-        if self.choices:
-            words.append(checks.choices(self.choices))
-        if self.low is not None and self.high is not None:
-            words.append(checks.interval(self.low, self.high, self.above))
-        if self.nan_is_none:
-            words.append('or .nan for none')
-        return ' '.join(words)
+        words = [choices(self.choices)] if self.choices else []
+        words += [str(self.within)] if self.within is not None else []
+        return ' '.join([*words, *['or .nan for none'] * self.nan_is_none])
 
     @property
-    def range(self) -> tuple[float, float] | None:
-        """Range in the descriptor. None: there is none, as where it would reject NaN."""
-        low = self.low if self.above is None else self.above
-        if low is None or self.high in (None, math.inf) or self.nan_is_none:
+    def limits(self) -> tuple[float, float] | None:
+        """The limits in the descriptor; None: there are none, as where they would reject NaN."""
+        if self.within is None or self.within.high == math.inf or self.nan_is_none:
             return None
-        assert self.high is not None
-        return low, self.high
+        return self.within.low if self.within.above is None else self.within.above, self.within.high
 
-    def permits(self, value: Any) -> bool:
-        """Return whether a value of the right type is allowed."""
-        if self.choices:
-            return value in self.choices
-        if isinstance(value, str):
-            return 0 < len(value) <= MAX_LENGTH
-        if isinstance(value, float) and math.isnan(value):
-            return self.nan_is_none
-        if self.low is None or self.high is None:
-            return True
-        return checks.inside(value, self.low, self.high, self.above)
+    def converted(self, value: Any) -> Any:
+        """Return a value, converted to a double if it is an integer for a double (`-p kp:=1`)."""
+        return float(value) if type(value) is int and type(self.default) is float else value
+
+    def check(self, value: Any) -> None:
+        """Raise ParameterError if a value has another type or is not allowed."""
+        wanted = type(self.default)
+        if type(value) is not wanted:
+            allowed = _TYPE_NAMES[wanted]
+        elif self.choices:
+            allowed = '' if value in self.choices else self.allowed
+        elif wanted is str:
+            fits = 0 < len(value) <= MAX_LENGTH
+            allowed = '' if fits else f'not empty and at most {MAX_LENGTH} characters'
+        elif self.within is None or (self.nan_is_none and math.isnan(value)) or value in self.within:
+            allowed = ''
+        else:
+            allowed = self.allowed
+        if allowed:
+            raise ParameterError(f"parameter '{self.name}' must be {allowed}, got {_got(value)}")
+
+
+def _got(value: object) -> str:
+    """Return a value for an error message, with limited length."""
+    if not isinstance(value, str):
+        return printable(repr(value))
+    length = f' ({len(value)} characters)' if len(value) > MAX_LENGTH else ''
+    return f"'{printable(value)}'{length}"
 
 
 def parameter(
-    default: Any,
-    description: str,
-    *,
-    bounds: tuple[float, float] | None = None,
-    above: float | None = None,
-    **others: Any,
+    default: Any, description: str, within: Range | None = None, *, name: str = '', **others: Any
 ) -> Any:
     """Declare a field of a `NodeParameters` class.
 
     Args:
-        default: Default value; bool, int, float or str.
-        description: As in `Specification`, as the other arguments.
-        bounds: `low` and `high`.
-        above: Lower bound that is itself not allowed, besides `bounds`.
-        others: Further fields of the `Specification`.
+        default: As in `Parameter`, as the other arguments.
+        description: One sentence with the unit in brackets.
+        within: The numbers allowed.
+        name: ROS name, if it differs from that of the field.
+        others: Further fields of the `Parameter`.
     """
-    low, high = bounds or ((None, None) if above is None else (-math.inf, math.inf))
-    specification = Specification(description=description, low=low, high=high, above=above, **others)
-    return dataclasses.field(default=default, metadata={'parameter': specification})
+    declared = {'name': name, 'description': description, 'within': within, **others}
+    return dataclasses.field(default=default, metadata={'parameter': declared})
 
 
 P = TypeVar('P', bound='NodeParameters')
@@ -122,92 +132,49 @@ class NodeParameters:
 
     def __post_init__(self) -> None:
         """Validate every value, then all together."""
-        for name, (field, specification) in specifications(type(self)).items():
-            value, wanted = getattr(self, field), type(default_of(type(self), field))
-            if type(value) is not wanted:
-                raise ParameterError(
-                    f"parameter '{name}' must be {_TYPE_NAMES[wanted]}, got {_got(value)}"
-                )
-            if not specification.permits(value):
-                raise ParameterError(
-                    f"parameter '{name}' must be {specification.allowed or NOT_EMPTY}, got {_got(value)}"
-                )
+        for one in self.declared().values():
+            one.check(getattr(self, one.field))
         self.check()
 
     def check(self) -> None:
         """Raise ParameterError if values contradict each other. For subclasses."""
 
-    @classmethod
-    def extended(cls: type[P], values: Mapping[str, Any]) -> type[P]:
-        """Return the class with the parameters that others with these values, by ROS name, need."""
-        return cls
+    def declared(self) -> dict[str, Parameter]:
+        """Return the parameters by their ROS names."""
+        kind: Any = type(self)
+        return _declared_fields(kind)
+
+    def by_name(self) -> dict[str, Any]:
+        """Return the values by their ROS names."""
+        return {name: getattr(self, one.field) for name, one in self.declared().items()}
+
+    def changed(self: P, values: Mapping[str, Any]) -> P:
+        """Return the parameters with new values by their ROS names. Unknown names are ignored.
+
+        It is the same object if no value applies.
+
+        Raises:
+            ParameterError: The new values are invalid.
+        """
+        known = self.declared()
+        given = {
+            known[name].field: known[name].converted(value)
+            for name, value in values.items()
+            if name in known
+        }
+        return replace(self, **given) if given else self
+
+    def at_start(self: P, values: Mapping[str, Any]) -> P:
+        """Return these defaults with the values that the user gave, as `changed`."""
+        return self.changed(values)
 
 
-def _got(value: object) -> str:
-    """Return a value for an error message, with limited length."""
-    if not isinstance(value, str):
-        return printable(repr(value))
-    length = f' ({len(value)} characters)' if len(value) > MAX_LENGTH else ''
-    return f"'{printable(value)}'{length}"
-
-
-_TYPE_NAMES = {
-    bool: 'a bool (true or false)',
-    int: 'an integer',
-    float: 'a double (as 1.0)',
-    str: 'a string',
-}
-
-
-def specifications(parameters: type[NodeParameters]) -> dict[str, tuple[str, Specification]]:
-    """Map each ROS name to its field and its specification."""
+@cache
+def _declared_fields(kind: Any) -> dict[str, Parameter]:
     found = {}
-    for field in dataclasses.fields(parameters):
-        specification: Specification = field.metadata['parameter']
-        found[specification.name or field.name] = (field.name, specification)
+    for field in dataclasses.fields(kind):
+        if 'parameter' in field.metadata:
+            declared = {'field': field.name, 'default': field.default, **field.metadata['parameter']}
+            declared['name'] = declared['name'] or field.name
+            found[declared['name']] = Parameter(**declared)
     return found
-
-
-def default_of(parameters: type[NodeParameters], field: str) -> Any:
-    """Return the default value of a field."""
-    return parameters.__dataclass_fields__[field].default
-
-
-def as_declared(parameters: type[NodeParameters], name: str, value: Any) -> Any:
-    """Return a value, converted to a double if it is an integer for a double (`-p kp:=1`)."""
-    known = specifications(parameters)
-    if name in known and type(value) is int and type(default_of(parameters, known[name][0])) is float:
-        return float(value)
-    return value
-
-
-def from_ros(parameters: type[P], values: Mapping[str, Any]) -> P:
-    """Return the parameters with values by their ROS names. Unknown names are ignored.
-
-    Raises:
-        ParameterError: The values are invalid.
-    """
-    parameters = parameters.extended(values)
-    known = specifications(parameters)
-    given = {name: as_declared(parameters, name, value) for name, value in values.items()}
-    return parameters(**{known[name][0]: value for name, value in given.items() if name in known})
-
-
-def changed(parameters: P, values: Mapping[str, Any]) -> P:
-    """Return the parameters with new values by their ROS names. Unknown names are ignored.
-
-    It is the same object if no value applies.
-
-    Raises:
-        ParameterError: The new values are invalid.
-    """
-    before = ros_values(parameters)
-    return (
-        from_ros(type(parameters), {**before, **values}) if before.keys() & values.keys() else parameters
-    )
-
-
-def ros_values(parameters: NodeParameters) -> dict[str, Any]:
-    """Return the values of parameters by their ROS names."""
-    known = specifications(type(parameters))
-    return {name: getattr(parameters, field) for name, (field, _) in known.items()}

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar, cast
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
 from diffdrive_jacobian.control.controller import (
     KP,
@@ -28,6 +27,7 @@ from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
 from diffdrive_jacobian.control.waypoints import Arrival
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
+from diffdrive_jacobian.numerics.checks import between
 from diffdrive_jacobian.parameters.common import (
     TwistParameters,
     check_wheel_lag,
@@ -37,8 +37,8 @@ from diffdrive_jacobian.parameters.common import (
     wheel_lag_field,
 )
 from diffdrive_jacobian.parameters.declaration import (
+    Parameter,
     ParameterError,
-    default_of,
     parameter,
 )
 from diffdrive_jacobian.simulation.actuators import Actuators
@@ -63,18 +63,28 @@ def _controller(default: str, choices: Controllers[Any]) -> Any:
     )
 
 
+def _description(gain: Gain) -> str:
+    return f'{gain.description} [{gain.unit}].' if gain.unit else f'{gain.description}.'
+
+
 def _gain(gain: Gain) -> Any:
-    unit = f' [{gain.unit}]' if gain.unit else ''
-    return parameter(gain.default, f'{gain.description}{unit}.', bounds=gain.bounds, above=gain.above)
+    return parameter(gain.default, _description(gain), gain.range)
 
 
 def _stopped(what: str, unit: str) -> Any:
     return parameter(
         math.nan,
         f'Largest {what} with which the robot counts as arrived [{unit}]; .nan: any.',
-        bounds=(1e-6, MAX_SPEED),
+        between(1e-6, MAX_SPEED),
         nan_is_none=True,
     )
+
+
+GAINS = {
+    gain.name: gain
+    for gain in (KP, KV, OFFSET, *(gain for one in PATH_CONTROLLERS for gain in one.gains))
+}
+"""The gains of the built-in controllers, which are among the fields."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,26 +93,24 @@ class GoToGoalParameters(TwistParameters):
     they say what the robot can do.
     """
 
-    controllers: ClassVar[Controllers[Controller]] = CONTROLLERS
+    controllers: Controllers[Controller] = CONTROLLERS
     """The controllers that can be chosen."""
-    path_controllers: ClassVar[Controllers[PathController]] = ALL_PATH_CONTROLLERS
+    path_controllers: Controllers[PathController] = ALL_PATH_CONTROLLERS
     """Those of paths."""
-
-    declared_gains: ClassVar[Mapping[str, Gain]] = {
-        gain.name: gain
-        for gain in (KP, KV, OFFSET, *(gain for one in PATH_CONTROLLERS for gain in one.gains))
-    }
-    """The gains among the parameters."""
+    more_gains: tuple[Gain, ...] = ()
+    """The gains of installed or given controllers that were chosen: parameters, too."""
+    gain_values: Mapping[str, float] = field(default_factory=dict)
+    """The values of those that are not among the fields below."""
 
     kp: float = _gain(KP)
     kv: float = _gain(KV)
     controller: str = _controller('go_to_goal', CONTROLLERS)
     offset: float = _gain(OFFSET)
     xy_goal_tolerance: float = parameter(
-        0.02, 'Tolerance on the distance to the goal [m].', bounds=(1e-6, 100.0)
+        0.02, 'Tolerance on the distance to the goal [m].', between(1e-6, 100.0)
     )
     yaw_goal_tolerance: float = parameter(
-        0.02, 'Tolerance on the heading error [rad].', bounds=(1e-6, math.pi)
+        0.02, 'Tolerance on the heading error [rad].', between(1e-6, math.pi)
     )
     use_goal_heading: bool = parameter(
         False, 'Turn to the heading of the last goal after its position is reached.'
@@ -117,30 +125,30 @@ class GoToGoalParameters(TwistParameters):
         'acceleration, with its lag and delay.',
     )
     path_controller: str = _controller('pure_pursuit', ALL_PATH_CONTROLLERS)
-    lookahead_distance: float = _gain(declared_gains['lookahead_distance'])
-    k_x: float = _gain(declared_gains['k_x'])
-    k_y: float = _gain(declared_gains['k_y'])
-    k_theta: float = _gain(declared_gains['k_theta'])
-    k_point: float = _gain(declared_gains['k_point'])
-    k_position: float = _gain(declared_gains['k_position'])
-    k_velocity: float = _gain(declared_gains['k_velocity'])
+    lookahead_distance: float = _gain(GAINS['lookahead_distance'])
+    k_x: float = _gain(GAINS['k_x'])
+    k_y: float = _gain(GAINS['k_y'])
+    k_theta: float = _gain(GAINS['k_theta'])
+    k_point: float = _gain(GAINS['k_point'])
+    k_position: float = _gain(GAINS['k_position'])
+    k_velocity: float = _gain(GAINS['k_velocity'])
     path_speed: float = parameter(
-        0.2, 'Speed along a path without times [m/s].', bounds=(1e-3, MAX_SPEED)
+        0.2, 'Speed along a path without times [m/s].', between(1e-3, MAX_SPEED)
     )
     path_deceleration: float = parameter(
         0.5,
         'Deceleration towards the end of a path, at most linear.x.max_deceleration [m/s^2].',
-        bounds=(1e-3, MAX_SPEED),
+        between(1e-3, MAX_SPEED),
     )
     path_approach_distance: float = parameter(
         0.3,
         'Distance from a path beyond which the robot first drives to it as to a goal [m].',
-        bounds=(1e-3, 1e6),
+        between(1e-3, 1e6),
     )
     max_path_distance: float = parameter(
         math.nan,
         'Largest distance of the robot from the start of a path; others are refused [m].',
-        bounds=(1e-3, 1e6),
+        between(1e-3, 1e6),
         nan_is_none=True,
     )
     pass_waypoints: bool = parameter(
@@ -150,76 +158,100 @@ class GoToGoalParameters(TwistParameters):
     waypoint_tolerance: float = parameter(
         0.1,
         'Largest distance at which a pose of goals counts as passed, with pass_waypoints [m].',
-        bounds=(1e-6, 100.0),
+        between(1e-6, 100.0),
     )
     odom_timeout: float = timeout_field(
         'Time without odometry after which the robot stops, until it returns [s]; 0: never.',
     )
 
-    @classmethod
-    def with_controller(cls, controller: Controller) -> type[GoToGoalParameters]:
-        """Return the class of the parameters with a further controller, which is the default.
+    def __getattr__(self, name: str) -> float:
+        """Return a gain that is not among the fields: a law asks for each by its name."""
+        values: Mapping[str, float] = {} if name == 'gain_values' else self.gain_values
+        if name in values:
+            return values[name]
+        raise AttributeError(f'{type(self).__name__} has no attribute {name!r}')
+
+    def with_controller(self, controller: Controller) -> GoToGoalParameters:
+        """Return these with a further controller, which is chosen.
 
         Raises:
             ValueError: It is not a Controller, or has the name of a built-in one.
         """
-        return cls._with_default(controller, CONTROLLERS.with_controller(controller))
+        known = self.controllers.with_controller(controller)
+        return replace(self, controllers=known, controller=controller.name)
 
-    @classmethod
-    def with_path_controller(cls, controller: PathController) -> type[GoToGoalParameters]:
+    def with_path_controller(self, controller: PathController) -> GoToGoalParameters:
         """As `with_controller`, for a controller of paths."""
-        return cls._with_default(controller, ALL_PATH_CONTROLLERS.with_controller(controller))
+        known = self.path_controllers.with_controller(controller)
+        return replace(self, path_controllers=known, path_controller=controller.name)
 
-    @classmethod
-    def _with_default(cls, controller: C, known: Controllers[C]) -> type[GoToGoalParameters]:
-        choice = (known.parameter, str, _controller(controller.name, known))
-        return cls._subclass([choice], {f'{known.parameter}s': known})
+    def declared(self) -> dict[str, Parameter]:
+        """Return the parameters by their ROS names, with the gains of the controllers."""
+        found = dict(TwistParameters.declared(self))
+        for known in (self.controllers, self.path_controllers):
+            found[known.parameter] = replace(found[known.parameter], choices=known)
+        for gain in self.more_gains:
+            found[gain.name] = Parameter(
+                name=gain.name,
+                field=gain.name,
+                default=gain.default,
+                description=_description(gain),
+                within=gain.range,
+            )
+        return found
 
-    @classmethod
-    def extended(cls, values: Mapping[str, Any]) -> type[GoToGoalParameters]:
-        """Return the class that has the gains of the controllers, too, with the defaults they declare.
+    def changed(self, values: Mapping[str, Any]) -> GoToGoalParameters:
+        """Return the parameters with new values by their ROS names, as `NodeParameters.changed`.
 
-        Raises:
-            ParameterError: A controller cannot be loaded, or a gain has the name of something else, or
-                another range than the gain of that name.
+        The gains of controllers that are chosen become parameters, and stay. Raises ParameterError, too,
+        if one cannot be loaded, or if a gain has the name of something else, or another range than the
+        gain of that name.
         """
-        return cls._with_gains(cls.controllers, values)._with_gains(cls.path_controllers, values)
+        before = self._with_gains(values)
+        known = before.declared()
+        given = {name: known[name].converted(value) for name, value in values.items() if name in known}
+        if before is self and not given:
+            return self
+        more = {name: given.pop(name) for name in [*given] if name in before.gain_values}
+        fields = {known[name].field: value for name, value in given.items()}
+        return replace(before, gain_values={**before.gain_values, **more}, **fields)
 
-    @classmethod
-    def _with_gains(
-        cls, controllers: Controllers[Any], values: Mapping[str, Any]
-    ) -> type[GoToGoalParameters]:
-        parameter = controllers.parameter
-        name = values.get(parameter, default_of(cls, parameter))
-        if name not in controllers or name in controllers.built_in:
-            return cls
-        controller = _found(controllers, name)
-        new = [gain for gain in controller.gains if cls.declared_gains.get(gain.name) != gain]
-        for gain in new:
-            known = cls.declared_gains.get(gain.name)
-            if known is None and (hasattr(cls, gain.name) or gain.name in OF_RCLPY):
-                raise ParameterError(
-                    f"parameter '{parameter}': {name!r} has a gain {gain.name!r}, a name that "
-                    'go_to_goal uses otherwise: choose another one'
-                )
-            if known is not None and not gain.shares_range(known):
-                raise ParameterError(
-                    f"parameter '{parameter}': {name!r} has a gain {gain.name!r} with another unit or "
-                    'other bounds than the parameter of that name: choose another name'
-                )
-        gains = {**cls.declared_gains, **{gain.name: gain for gain in new}}
-        fields = [(gain.name, float, _gain(gain)) for gain in new]
-        return cls._subclass(fields, {'declared_gains': gains}) if new else cls
+    def at_start(self, values: Mapping[str, Any]) -> GoToGoalParameters:
+        """Return these defaults with those of the controllers, and the values that the user gave."""
+        before = self._with_gains(values)
+        own = {gain.name: gain.default for gain in before.more_gains}
+        return before.changed({**own, **values})
 
-    @classmethod
-    def _subclass(
-        cls, fields: Iterable[tuple[str, type, Any]], namespace: dict[str, Any]
-    ) -> type[GoToGoalParameters]:
-        options: Any = {'frozen': True, 'kw_only': True, 'slots': True}
-        made = dataclasses.make_dataclass(
-            cls.__name__, fields, bases=(cls,), namespace=namespace, **options
-        )
-        return cast('type[GoToGoalParameters]', made)
+    def _with_gains(self, values: Mapping[str, Any]) -> GoToGoalParameters:
+        """Return these with the gains of the controllers that are chosen with new values."""
+        more = {gain.name: gain for gain in self.more_gains}
+        choices: tuple[Controllers[Any], ...] = self.controllers, self.path_controllers
+        for known in choices:
+            name = values.get(known.parameter, getattr(self, known.parameter))
+            if name not in known or name in known.built_in:
+                continue
+            for gain in _found(known, name).gains:
+                self._check_gain(gain, more.get(gain.name) or GAINS.get(gain.name), known, name)
+                if GAINS.get(gain.name) != gain:
+                    more[gain.name] = gain
+        gains = tuple(more.values())
+        if gains == self.more_gains:
+            return self
+        new = {gain.name: gain.default for gain in gains if gain.name not in GAINS}
+        return replace(self, more_gains=gains, gain_values={**new, **self.gain_values})
+
+    def _check_gain(
+        self, gain: Gain, known: Gain | None, controllers: Controllers[Any], name: str
+    ) -> None:
+        """Raise ParameterError if a gain cannot be a parameter beside what is `known` by its name."""
+        what = f"parameter '{controllers.parameter}': {name!r} has a gain {gain.name!r}"
+        if known is None and (hasattr(type(self), gain.name) or gain.name in OF_RCLPY):
+            raise ParameterError(f'{what}, a name that go_to_goal uses otherwise: choose another one')
+        if known is not None and not gain.shares_range(known):
+            raise ParameterError(
+                f'{what} with another unit or other bounds than the parameter of that name: choose '
+                'another name'
+            )
 
     def limits(self, default: float = MAX_SPEED) -> VelocityLimits:
         """Return the limits of the commands, at most the largest plausible twist."""

@@ -9,9 +9,9 @@ from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
 
-NODE_PARAMETERS: tuple[type[NodeParameters], ...] = (
-    VirtualRobotParameters,
-    GoToGoalParameters,
-    WheelBridgeParameters,
+NODE_PARAMETERS: tuple[NodeParameters, ...] = (
+    VirtualRobotParameters(),
+    GoToGoalParameters(),
+    WheelBridgeParameters(),
 )
-"""The parameters of all nodes of this package."""
+"""The parameters of all nodes of this package, with their defaults."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from diffdrive_jacobian.messages.conversion import MAX_POSITION
+from diffdrive_jacobian.numerics.checks import between
 from diffdrive_jacobian.parameters.common import (
     WheelParameters,
     check_wheel_lag,
@@ -33,7 +34,7 @@ def _true_multiplier(what: str) -> Any:
     return parameter(
         1.0,
         f'True {what}, relative to the nominal one [-]. Read-only.',
-        bounds=(0.1, 10.0),
+        between(0.1, 10.0),
         read_only=True,
     )
 
@@ -43,7 +44,7 @@ class VirtualRobotParameters(WheelParameters):
     """Parameters of the node virtual_robot."""
 
     publish_rate: float = parameter(
-        50.0, 'Publishing rate of odom and joint_states [Hz].', bounds=(0.1, 1000.0)
+        50.0, 'Publishing rate of odom and joint_states [Hz].', between(0.1, 1000.0)
     )
     odom_frame_id: str = parameter('odom', 'Name of the frame of the odometry.')
     base_frame_id: str = parameter('base_link', 'Name of the frame of the robot, at the axle centre.')
@@ -53,18 +54,18 @@ class VirtualRobotParameters(WheelParameters):
     wheel_lag: float = wheel_lag_field()
     command_delay: float = command_delay_field()
     x: float = parameter(
-        0.0, 'Initial position x, also after a reset [m].', bounds=(-MAX_POSITION, MAX_POSITION)
+        0.0, 'Initial position x, also after a reset [m].', between(-MAX_POSITION, MAX_POSITION)
     )
     y: float = parameter(
-        0.0, 'Initial position y, also after a reset [m].', bounds=(-MAX_POSITION, MAX_POSITION)
+        0.0, 'Initial position y, also after a reset [m].', between(-MAX_POSITION, MAX_POSITION)
     )
     theta: float = parameter(
-        0.0, 'Initial heading, also after a reset [rad].', bounds=(-math.tau, math.tau)
+        0.0, 'Initial heading, also after a reset [rad].', between(-math.tau, math.tau)
     )
     wheel_travel_variance: float = parameter(
         1e-5,
         'Variance of the distance travelled by a wheel, per distance [m^2/m].',
-        bounds=(0.0, 1.0),
+        between(0.0, 1.0),
     )
     command_interface: str = parameter(
         'twist',
@@ -83,7 +84,7 @@ class VirtualRobotParameters(WheelParameters):
         read_only=True,
     )
     slip_seed: int = parameter(
-        0, 'Seed of the random slip. Read-only.', bounds=(0, MAX_SEED), read_only=True
+        0, 'Seed of the random slip. Read-only.', between(0, MAX_SEED), read_only=True
     )
     true_left_wheel_radius_multiplier: float = _true_multiplier('radius of the left wheel')
     true_right_wheel_radius_multiplier: float = _true_multiplier('radius of the right wheel')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from diffdrive_jacobian.numerics.checks import between
 from diffdrive_jacobian.parameters.common import WheelParameters, timeout_field
 from diffdrive_jacobian.parameters.declaration import parameter
 
@@ -18,7 +19,7 @@ class WheelBridgeParameters(WheelParameters):
     publish_rate: float = parameter(
         50.0,
         'Publishing rate of joint_command while the wheels accelerate within limits [Hz].',
-        bounds=(0.1, 1000.0),
+        between(0.1, 1000.0),
     )
     joint_command_type: str = parameter(
         'JointState',

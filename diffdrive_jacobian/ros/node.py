@@ -29,12 +29,7 @@ from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import Codec
 from diffdrive_jacobian.messages.conversion import MessageError, integer_warning
 from diffdrive_jacobian.messages.names import type_name
-from diffdrive_jacobian.parameters.declaration import (
-    NodeParameters,
-    ParameterError,
-    as_declared,
-    changed,
-)
+from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError
 from diffdrive_jacobian.ros.graph_faults import (
     ALTERNATION_PATIENCE,
     MAX_AGE,
@@ -76,12 +71,12 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     parameters: P
 
-    def __init__(self, name: str, parameters: type[P], **kwargs: Any) -> None:
+    def __init__(self, name: str, defaults: P, **kwargs: Any) -> None:
         """Declare the parameters with the values that the user gave.
 
         Args:
             name: Name of the node.
-            parameters: The dataclass of its parameters.
+            defaults: Its parameters with their defaults.
             kwargs: Passed on to `rclpy.node.Node` (context, namespace, parameter_overrides, ...).
 
         Raises:
@@ -89,7 +84,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         """
         super().__init__(name, **kwargs)
         try:
-            self.parameters = declare(self, parameters)
+            self.parameters = declare(self, defaults)
         except ParameterError:
             self.destroy_node()
             raise
@@ -227,28 +222,27 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     def _accept_integers(self, changes: list[Parameter]) -> list[Parameter]:
         """Convert integers to doubles where doubles are declared."""
-        kind = type(self.parameters)
+        known = self.parameters.declared()
         return [
-            Parameter(change.name, value=as_declared(kind, change.name, change.value))
-            if change.type_ == Parameter.Type.INTEGER
+            Parameter(change.name, value=known[change.name].converted(change.value))
+            if change.type_ == Parameter.Type.INTEGER and change.name in known
             else change
             for change in changes
         ]
 
     def _validate_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            changed(self.parameters, {one.name: one.value for one in changes})
+            self.parameters.changed({one.name: one.value for one in changes})
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, changes: list[Parameter]) -> None:
         previous = self.parameters
-        self.parameters = changed(previous, {one.name: one.value for one in changes})
+        self.parameters = previous.changed({one.name: one.value for one in changes})
         if self.parameters is previous:
             return
-        if type(self.parameters) is not type(previous):
-            self.parameters = declare_new(self, previous, self.parameters)
+        self.parameters = declare_new(self, previous, self.parameters)
         self.parameters_changed(previous)
 
     # --- Checks

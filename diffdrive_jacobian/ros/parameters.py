@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import TypeVar
 from weakref import WeakKeyDictionary
 
 from rcl_interfaces.msg import (
@@ -19,11 +19,8 @@ from rclpy.node import Node
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import (
     NodeParameters,
+    Parameter,
     ParameterError,
-    Specification,
-    from_ros,
-    ros_values,
-    specifications,
 )
 from diffdrive_jacobian.parameters.file import is_shared, sections
 from diffdrive_jacobian.ros.rclpy_internals import (
@@ -38,33 +35,33 @@ SHORT = 3
 P = TypeVar('P', bound=NodeParameters)
 
 
-def descriptor(specification: Specification, value: Any) -> ParameterDescriptor:
-    """Return the descriptor of a parameter with such values, which `ros2 param describe` shows."""
-    constraint = specification.constraint or specification.allowed
+def descriptor(parameter: Parameter) -> ParameterDescriptor:
+    """Return the descriptor of a parameter, which `ros2 param describe` shows."""
+    constraint = parameter.constraint or parameter.allowed
     result = ParameterDescriptor(
-        description=specification.description,
-        read_only=specification.read_only,
+        description=parameter.description,
+        read_only=parameter.read_only,
         additional_constraints=f'must be {constraint}' if constraint else '',
     )
-    if specification.range is None:
+    if parameter.limits is None:
         return result
-    low, high = specification.range
-    if isinstance(value, float):
+    low, high = parameter.limits
+    if isinstance(parameter.default, float):
         result.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     else:
         result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
     return result
 
 
-def declare(node: Node, parameters: type[P]) -> P:
+def declare(node: Node, defaults: P) -> P:
     """Declare all parameters of a node with the values that the user gave, and return them.
 
     Raises:
         ParameterError: The values are invalid. No parameter is declared.
     """
     overrides = parameter_overrides(node)
-    initial = from_ros(parameters, {name: given.value for name, given in overrides.items()})
-    _declare(node, initial, specifications(type(initial)))
+    initial = defaults.at_start({name: given.value for name, given in overrides.items()})
+    _declare(node, initial, initial.declared())
     return initial
 
 
@@ -73,11 +70,11 @@ def declare_new(node: Node, before: P, after: P) -> P:
 
     The new ones have the values that the user gave. An invalid value is ignored, with a warning.
     """
-    new = specifications(type(after)).keys() - specifications(type(before)).keys()
+    new = after.declared().keys() - before.declared().keys()
     overrides = parameter_overrides(node)
     for name in sorted(new & overrides.keys()):
         try:
-            after = from_ros(type(after), ros_values(after) | {name: overrides[name].value})
+            after = after.changed({name: overrides[name].value})
         except ParameterError as error:
             node.get_logger().warning(f'{error}; the default is used')
     _declare(node, after, new)
@@ -85,8 +82,8 @@ def declare_new(node: Node, before: P, after: P) -> P:
 
 
 def _declare(node: Node, parameters: NodeParameters, names: Iterable[str]) -> None:
-    known, values = specifications(type(parameters)), ros_values(parameters)
-    declared = [(name, values[name], descriptor(known[name][1], values[name])) for name in names]
+    known, values = parameters.declared(), parameters.by_name()
+    declared = [(name, values[name], descriptor(known[name])) for name in names]
     node.declare_parameters('', declared, ignore_override=True)
 
 
@@ -150,7 +147,7 @@ def report_unknown(nodes: Sequence[Node], others: Iterable[Node] = ()) -> None:
 
     from diffdrive_jacobian.parameters.nodes import NODE_PARAMETERS
 
-    ours = {name for one in NODE_PARAMETERS for name in specifications(one)}
+    ours = {name for one in NODE_PARAMETERS for name in one.declared()}
     known = sorted(name for name in declared if not name.startswith(PARAMETERS_OF_RCLPY))
     programs = sorted({f'{_program(node)} --help' for node in nodes})
     shared = set().union(*(_shared(node.context) for node in nodes))

@@ -275,7 +275,6 @@ def robot_at(lockstep: Lockstep) -> Callable[..., VirtualRobot]:
     from rclpy.parameter import Parameter
 
     from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-    from diffdrive_jacobian.parameters.declaration import specifications
     from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 
     def place(
@@ -283,7 +282,7 @@ def robot_at(lockstep: Lockstep) -> Callable[..., VirtualRobot]:
     ) -> VirtualRobot:
         values = {'x': float(x), 'y': float(y), 'theta': float(theta)}
         values |= {name.replace('__', '.'): value for name, value in parameters.items()}
-        known = specifications(VirtualRobotParameters)
+        known = VirtualRobotParameters().declared()
         if unknown := sorted(set(values) - set(known)):
             raise TypeError(f'virtual_robot has no parameter {unknown[0]!r}; it has {", ".join(known)}')
         overrides = [Parameter(name, value=value) for name, value in values.items()]

@@ -16,8 +16,8 @@ from diffdrive_jacobian import __version__
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_POSITION
 from diffdrive_jacobian.numerics import checks
-from diffdrive_jacobian.numerics.checks import Check, between, finite, inside, integer, one_of
-from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, specifications
+from diffdrive_jacobian.numerics.checks import Check, between, finite, integer, one_of
+from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError
 from diffdrive_jacobian.parameters.file import configurations
 from diffdrive_jacobian.tools._output import note
 
@@ -94,7 +94,7 @@ def _checked(check: Check, value: T) -> T:
 
 def _in_radians(_: str, value: float) -> None:
     """Require at most one turn: more is probably in degrees."""
-    if not inside(value, -math.tau, math.tau):
+    if value not in between(-math.tau, math.tau):
         raise ValueError(
             f"must be in radians, from -2 pi to 2 pi, got '{value:g}' "
             f'({value:g} degrees are {math.radians(value):.6g} rad)'
@@ -212,7 +212,7 @@ class Parser(argparse.ArgumentParser):
         arguments: Sequence[str],
         *,
         ros: bool = True,
-        parameters: Sequence[type[NodeParameters]] = (),
+        parameters: Sequence[NodeParameters] = (),
         hint: str = '',
     ) -> argparse.Namespace:
         """Parse a command line. An error about unknown arguments says what was probably meant.
@@ -240,14 +240,14 @@ class Parser(argparse.ArgumentParser):
         options.ros = of_ros
         return options
 
-    def _meant(self, words: Sequence[str], parameters: Sequence[type[NodeParameters]]) -> str:
+    def _meant(self, words: Sequence[str], parameters: Sequence[NodeParameters]) -> str:
         """Return what was probably meant by the first unknown option. Empty: this is not known."""
         place = next((index for index, word in enumerate(words) if word.startswith('--')), None)
         if place is None:
             return ''
         option, _, value = words[place].partition('=')
         name = option[2:].replace('-', '_')
-        if any(name in specifications(one) for one in parameters):
+        if any(name in one.declared() for one in parameters):
             after = ''.join(words[place + 1 : place + 2])
             value = value or (after if after and not after.startswith('--') else 'VALUE')
             return f'{name} is a ROS parameter: --ros-args -p {name}:={value}'
@@ -342,7 +342,7 @@ class Parser(argparse.ArgumentParser):
                 self.error('--degrees needs --heading, whose unit it changes')
             return None
         if options.degrees:
-            if not inside(value, -360.0, 360.0):
+            if value not in between(-360.0, 360.0):
                 self.error(f"argument --heading: must be from -360 to 360 degrees, got '{value:g}'")
             return math.radians(value)
         try:

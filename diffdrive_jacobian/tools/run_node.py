@@ -6,12 +6,11 @@ import argparse
 import importlib
 import textwrap
 from collections.abc import Sequence
-from dataclasses import fields
 from itertools import pairwise
 from typing import NamedTuple
 
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, specifications
+from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _output
 from diffdrive_jacobian.tools.entry_points import DONE, long_lived
@@ -66,7 +65,7 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
         # Not otherwise: to create the parser describes all parameters, which takes time.
         hint = 'send_goal X Y sends a goal' if name == 'go_to_goal' else ''
         try:
-            parameters = parameters_of(name).extended(_given(ros))
+            parameters = parameters_of(name).at_start(_chosen(ros))
         except ParameterError as error:
             return _output.complain(name, error)
         ros = _parser(name, program, parameters).parse(arguments, parameters=[parameters], hint=hint).ros
@@ -89,20 +88,21 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     return DONE
 
 
-def _given(ros: Sequence[str]) -> dict[str, str]:
-    """Return the parameters among ROS arguments, as text."""
+def _chosen(ros: Sequence[str]) -> dict[str, str]:
+    """Return the controllers among the parameters that ROS arguments give: they have gains."""
     texts = [text for flag, text in pairwise(ros) if flag in ('-p', '--param') and ':=' in text]
-    return dict(text.split(':=', 1) for text in texts)
+    given = dict(text.split(':=', 1) for text in texts)
+    return {name: given[name] for name in ('controller', 'path_controller') if name in given}
 
 
-def parameters_of(name: str) -> type[NodeParameters]:
+def parameters_of(name: str) -> NodeParameters:
     """Return the parameters of one of NODES, without an import of ROS or of those of other nodes."""
     module = importlib.import_module(f'diffdrive_jacobian.parameters.{name}')
-    parameters: type[NodeParameters] = getattr(module, f'{NODES[name].class_name}Parameters')
+    parameters: NodeParameters = getattr(module, f'{NODES[name].class_name}Parameters')()
     return parameters
 
 
-def _parser(name: str, program: Program, parameters: type[NodeParameters]) -> _cli.Parser:
+def _parser(name: str, program: Program, parameters: NodeParameters) -> _cli.Parser:
     parser = _cli.Parser(
         prog=name,
         usage=f'{name} [-h] [--params-file FILE | --robot NAME] '
@@ -115,13 +115,12 @@ def _parser(name: str, program: Program, parameters: type[NodeParameters]) -> _c
     return parser
 
 
-def _description(parameters: type[NodeParameters]) -> str:
+def _description(parameters: NodeParameters) -> str:
     """Return the description of all parameters."""
-    defaults = {field.name: field.default for field in fields(parameters)}
     lines, indent = ['parameters:'], ' ' * 6
-    for ros_name, (field, specification) in specifications(parameters).items():
-        allowed = f' Must be {specification.allowed}.' if specification.allowed else ''
-        text = f'{specification.description}{allowed} (default: {defaults[field]})'
+    for ros_name, one in parameters.declared().items():
+        allowed = f' Must be {one.allowed}.' if one.allowed else ''
+        text = f'{one.description}{allowed} (default: {one.default})'
         wrapped = textwrap.wrap(text, 90, initial_indent=indent, subsequent_indent=indent)
         lines += [f'  {ros_name}', *wrapped]
     return '\n'.join(lines)

@@ -13,7 +13,6 @@ from typing import Any
 from diffdrive_jacobian.control import Controller, ControllerError
 from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.errors import DiffdriveError, UserError
-from diffdrive_jacobian.parameters.declaration import from_ros
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.plots import sweep_figure
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, free_stem, new_file
@@ -169,7 +168,7 @@ def _robot(options: argparse.Namespace) -> RobotModel:
         if limit is not None:
             values |= {f'{name}.max_velocity': limit, f'{name}.min_velocity': -limit}
     values |= _cli.following_parameters(options)
-    return from_ros(VirtualRobotParameters, values).model()
+    return VirtualRobotParameters().changed(values).model()
 
 
 def _parser(controller: Controller = CONTROLLERS.built_in['go_to_goal']) -> _cli.Parser:

@@ -36,7 +36,6 @@ from support import processes
 from support.damaged_messages import damaged
 from support.ros_messages import at_rest, goal, goals, joint_command, odometry, placement, twist
 
-from diffdrive_jacobian.parameters.declaration import default_of, specifications
 from diffdrive_jacobian.parameters.nodes import (
     GoToGoalParameters,
     VirtualRobotParameters,
@@ -124,9 +123,9 @@ class Team:
         """Set all parameters that can change to their defaults, or to those of TEAM."""
         for name, declared in DECLARED.items():
             messages = [
-                Parameter(one, value=TEAM[name].get(one, default_of(declared, field))).to_parameter_msg()
-                for one, (field, specification) in specifications(declared).items()
-                if not specification.read_only
+                Parameter(one, value=TEAM[name].get(one, parameter.default)).to_parameter_msg()
+                for one, parameter in declared().declared().items()
+                if not parameter.read_only
             ]
             # Twice: a limit may be refused while another one is still changed.
             for _ in range(2):
@@ -210,7 +209,7 @@ class Soak:
 
     def parameter(self):
         name = self.chance.choice(list(DECLARED))
-        parameter = self.chance.choice(list(specifications(DECLARED[name])))
+        parameter = self.chance.choice(list(DECLARED[name]().declared()))
         message = Parameter(parameter, value=self.chance.choice(VALUES)).to_parameter_msg()
         client = self.steady.set[name]
         client.remove_pending_request(client.call_async(SetParameters.Request(parameters=[message])))

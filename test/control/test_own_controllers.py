@@ -150,7 +150,7 @@ def test_the_user_can_choose_another_than_the_given_controller(lockstep):
 def test_only_controllers_with_a_name_of_their_own_can_be_given(lockstep):
     for bad in ('pose', law, None):
         with pytest.raises(ValueError, match='controller must be of class Controller'):
-            GoToGoalParameters.with_controller(bad)
+            GoToGoalParameters().with_controller(bad)
     with pytest.raises(ValueError, match="name of its own, got 'pose', which is built in"):
         GoToGoal(controller=replace(MINE, name='pose'))
     assert GoToGoal(controller=CONTROLLERS.built_in['pose']).get_parameter('controller').value == 'pose'

@@ -81,14 +81,14 @@ def test_gains_are_declared_when_their_controller_is_chosen(lockstep, site):
 
 def test_the_default_of_a_shared_gain_is_that_of_the_controller_chosen():
     own = replace(INTEGRAL, gains=(replace(KP, default=1.5), *INTEGRAL.gains[1:]))
-    assert GoToGoalParameters.with_controller(own).extended({})().kp == 1.5
+    assert GoToGoalParameters().with_controller(own).at_start({}).kp == 1.5
     parameters = GoToGoalParameters()
     assert (parameters.kp, parameters.kv, parameters.offset) == (3.0, 0.5, 0.1)
 
 
 def test_a_gain_cannot_take_a_name_that_the_node_uses_or_another_range(lockstep):
     """The parameter keeps its range when the controller is changed."""
-    used = ('odom_timeout', 'limits', 'check', 'extended', 'linear_x_max_velocity', 'use_sim_time')
+    used = ('odom_timeout', 'limits', 'check', 'at_start', 'linear_x_max_velocity', 'use_sim_time')
     refused = [(Gain(name=one, default=1.0), f"'{one}', a name that go_to_goal uses") for one in used]
     for gain in (
         Gain(name='kp', default=-2.0, bounds=(-10.0, 0.0)),

@@ -47,7 +47,7 @@ import textwrap
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 from types import ModuleType
@@ -60,7 +60,7 @@ from fork_server import forked
 from support.domains import domain_id
 
 import diffdrive_jacobian
-from diffdrive_jacobian.parameters.declaration import NodeParameters, specifications
+from diffdrive_jacobian.parameters.declaration import NodeParameters
 from diffdrive_jacobian.parameters.nodes import (
     GoToGoalParameters,
     VirtualRobotParameters,
@@ -327,13 +327,10 @@ def run_page(text: str, directory: Path) -> list[tuple[Block, str]]:
 @mock.patch('importlib.metadata.entry_points', new=mock.Mock(return_value=()))
 def parameter_table(parameters: type[NodeParameters]) -> str:
     """Return the table of the parameters of a node, without controllers that others have installed."""
-    values = {field.name: field.default for field in fields(parameters)}
     rows = ['| parameter | default | allowed | |', '|---|---|---|---|']
-    for name, (field, specification) in specifications(parameters).items():
-        allowed = specification.allowed.removeprefix('in ').replace("'", '`')
-        rows.append(
-            f'| `{name}` | {_written(values[field])} | {allowed} | {specification.description} |'
-        )
+    for name, one in parameters().declared().items():
+        allowed = one.allowed.removeprefix('in ').replace("'", '`')
+        rows.append(f'| `{name}` | {_written(one.default)} | {allowed} | {one.description} |')
     return '\n'.join(rows)
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 import re
 from contextlib import nullcontext
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.parameters.declaration import ParameterError, specifications
+from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.file import concerns, robot_parameters, sections
 from diffdrive_jacobian.parameters.nodes import (
     GoToGoalParameters,
@@ -58,11 +57,11 @@ def test_config_files_name_only_what_exists_agree_and_run():
             for (node_class, parameters), given in zip(
                 NODES.values(), (robot, goal, bridge), strict=True
             ):
-                known = specifications(parameters)
+                known = parameters().declared()
                 assert set(given) <= set(known)
                 node = node_class(context=context, namespace='any/where')
                 for ros_name, value in given.items():
-                    assert getattr(node.parameters, known[ros_name][0]) == value
+                    assert getattr(node.parameters, known[ros_name].field) == value
                 node.destroy_node()
 
 
@@ -70,23 +69,22 @@ def test_config_files_name_only_what_exists_agree_and_run():
 def test_every_parameter_is_described_as_declared(add, name):
     node_class, parameters = NODES[name]
     node = add(node_class)
-    defaults = {field.name: field.default for field in fields(parameters)}
-    for ros_name, (field, specification) in specifications(parameters).items():
+    for ros_name, declared in parameters().declared().items():
         description = node.describe_parameter(ros_name)
-        default = defaults[field]
+        default = declared.default
         assert description.type == TYPES[type(default)]
-        assert description.description == specification.description
-        assert description.read_only == specification.read_only
+        assert description.description == declared.description
+        assert description.read_only == declared.read_only
         value = node.get_parameter(ros_name).value
         assert value == default or (math.isnan(value) and math.isnan(default))
-        if type(default) is float and not specification.nan_is_none:
+        if type(default) is float and not declared.nan_is_none:
             (limits,) = description.floating_point_range
             assert limits.from_value <= default <= limits.to_value
         if type(default) is int:
             (limits,) = description.integer_range
-            assert (limits.from_value, limits.to_value) == (specification.low, specification.high)
+            assert (limits.from_value, limits.to_value) == (declared.within.low, declared.within.high)
         if type(default) is float:
-            assert '[' in specification.description, f'{ros_name} has no unit'
+            assert '[' in declared.description, f'{ros_name} has no unit'
 
 
 # --- What is refused

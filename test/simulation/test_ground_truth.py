@@ -15,7 +15,7 @@ from support.ros_messages import instants, placement, pose_of, twist
 
 from diffdrive_jacobian.bags.verification import COVARIANCE_TOLERANCE, verify
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
+from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
 from diffdrive_jacobian.plots.run_figure import COLOR, figure
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel
@@ -127,9 +127,9 @@ def test_invalid_parameters_are_named():
         ),
     ):
         with pytest.raises(ParameterError, match=named):
-            from_ros(VirtualRobotParameters, parameters)
+            VirtualRobotParameters().changed(parameters)
     # A perfect robot has no ground truth.
-    from_ros(VirtualRobotParameters, {'odom_frame_id': 'map', 'slip_seed': 2**63 - 1})
+    VirtualRobotParameters().changed({'odom_frame_id': 'map', 'slip_seed': 2**63 - 1})
 
 
 def test_slip_cannot_change_while_the_robot_drives(lockstep, robot_at):

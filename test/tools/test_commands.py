@@ -25,7 +25,6 @@ from support.commands import COMMANDS, error_of, interrupted, refused, run, run_
 from support.processes import PROGRAM
 
 from diffdrive_jacobian import __version__
-from diffdrive_jacobian.parameters.declaration import specifications
 from diffdrive_jacobian.tools import _cli, entry_points
 from diffdrive_jacobian.tools.run_node import parameters_of
 
@@ -193,7 +192,7 @@ def test_help_version_and_wrong_arguments(command, folder):
     assert helped.out.startswith(f'usage: {command} ')
     if command in entry_points.NODES:
         lines = {line.strip() for line in helped.out.splitlines()}
-        assert set(specifications(parameters_of(command))) <= lines
+        assert set(parameters_of(command).declared()) <= lines
     version = f'{command} (diffdrive_jacobian) {__version__}\n'
     assert run(command, '--version') == (0, version, '')
     assert refused(command, '--bogus')
