@@ -12,18 +12,18 @@ receive.
 from __future__ import annotations
 
 import inspect
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, TypeAlias
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
 from diffdrive_jacobian.lockstep._clock import Agenda
 from diffdrive_jacobian.lockstep._gate import Gate
-from diffdrive_jacobian.ros.rclpy_internals import queue_depth
 
 __tracebackhide__ = True
 
@@ -262,3 +262,8 @@ def _take_nothing(*_: Any) -> None:
 def is_latched(endpoint: Any) -> bool:
     """Return whether a publisher or subscription is transient local."""
     return bool(endpoint.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def queue_depth(profile: QoSProfile) -> int:
+    """Return the largest number of messages that wait in a queue (sys.maxsize: it has no limit)."""
+    return sys.maxsize if profile.history == HistoryPolicy.KEEP_ALL else max(profile.depth, 1)

@@ -21,8 +21,8 @@ from rclpy.task import Future, Task
 from diffdrive_jacobian.lockstep._clock import Agenda
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._gate import Gate, send_unless_destroyed
+from diffdrive_jacobian.lockstep._link import queue_depth
 from diffdrive_jacobian.lockstep._tasks import Facade, Tasks
-from diffdrive_jacobian.ros.rclpy_internals import queue_depth
 
 __tracebackhide__ = True
 

@@ -55,6 +55,31 @@ _FORWARD_AND_YAW = [6 * row + column for row in (0, 5) for column in (0, 5)]
 _planar, _forward_and_yaw = itemgetter(*_PLANAR), itemgetter(*_FORWARD_AND_YAW)
 
 
+class GoalError(MessageError):
+    """Goals that are invalid, in a message whose stamp was read."""
+
+    def __init__(self, why: str, stamp: tuple[int, int]) -> None:
+        """Say why, and by which stamp the goals are known."""
+        super().__init__(why)
+        self.stamp = stamp
+
+
+class Limit(NamedTuple):
+    """How many poses goals may have. They are counted before they are read, which may take long."""
+
+    topic: str
+    sequence: str
+    """Field with the poses."""
+    most: int
+
+    def check(self, sec: int, nanosec: int, count: int) -> None:
+        """Raise GoalError if there are more; `sec` and `nanosec` are the stamp of the message."""
+        if count > self.most:
+            raise GoalError(
+                f'{self.topic} must contain at most {self.most} poses, got {count}', (sec, nanosec)
+            )
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Codec(Generic[V]):
     """How one type of message becomes a value, and back."""
@@ -69,8 +94,8 @@ class Codec(Generic[V]):
     """Paths of the numbers that are written, as `cdr.Writer` takes them."""
     numbers: Callable[[V], tuple[Any, ...]] = lambda _: ()
     """Returns these numbers of a value."""
-    header: Codec[Any] | None = None
-    """What is read and checked before the rest, which may be long."""
+    limit: Limit | None = None
+    """How long the messages may be."""
 
     def reader(
         self, kind: Any, deserialize: Callable[[bytes, Any], Any] | None = None
@@ -81,9 +106,10 @@ class Codec(Generic[V]):
         the value is invalid.
         """
         read = Reader(kind, self.fields, self.value, deserialize=deserialize)
-        if self.header is None:
+        if (limit := self.limit) is None:
             return read
-        check = Reader(kind, self.header.fields, self.header.value, whole=False, deserialize=deserialize)
+        fields = (*STAMP, f'len({limit.sequence})')
+        check = Reader(kind, fields, limit.check, whole=False, deserialize=deserialize)
 
         def checked(data: bytes) -> V:
             check(data)
@@ -268,15 +294,6 @@ POSE_WITH_COVARIANCE = Codec(
 # --- Goals: goal_pose, goals, path, goal_status
 
 
-class GoalError(MessageError):
-    """Goals that are invalid, in a message whose stamp was read."""
-
-    def __init__(self, why: str, stamp: tuple[int, int]) -> None:
-        """Say why, and by which stamp the goals are known."""
-        super().__init__(why)
-        self.stamp = stamp
-
-
 class Route(NamedTuple):
     """Goals that came in one message."""
 
@@ -372,17 +389,6 @@ def _times(stamps: list[tuple[int, int]]) -> tuple[float, ...] | None:
     return tuple((time - times[0]) / NANOSECONDS for time in times)
 
 
-def _at_most(most: int, what: str) -> Codec[Any]:
-    """Return what is read of goals before their poses, to refuse too many."""
-
-    def check(sec: int, nanosec: int, count: int) -> None:
-        if count > most:
-            raise GoalError(f'{what} must contain at most {most} poses, got {count}', (sec, nanosec))
-
-    poses = 'goals' if what == 'goals' else 'poses'
-    return Codec('', (*STAMP, f'len({poses})'), check)
-
-
 TO_STOP = 'to stop, call cancel_goal'
 POSE = Codec(
     'geometry_msgs/msg/PoseStamped',
@@ -393,7 +399,7 @@ GOALS = Codec(
     'nav_msgs/msg/Goals',
     (*STAMP, FRAME, 'goals[].header.frame_id', *(f'goals[].pose.{field}' for field in _POSE)),
     _goals,
-    header=_at_most(MAX_WAYPOINTS, 'goals'),
+    limit=Limit('goals', 'goals', MAX_WAYPOINTS),
 )
 PATH = Codec(
     'nav_msgs/msg/Path',
@@ -403,7 +409,7 @@ PATH = Codec(
         *(f'poses[].pose.{field}' for field in _POSE),
     ),
     _path,
-    header=_at_most(MAX_PATH_POSES, 'path'),
+    limit=Limit('path', 'poses', MAX_PATH_POSES),
 )
 GOAL_STATUS = Codec(
     'action_msgs/msg/GoalStatus',

@@ -154,12 +154,10 @@ class GoalClient(Node):  # type: ignore[misc]
         self.goals = poses
         self.index = 0
         """Index of the goal that is being driven to."""
-        self.path: PathProgress | None = None
+        self.path = PathProgress(goals) if isinstance(goals, Path) else None
+        """The path and the progress along it. None: goals are sent."""
         # Times of the first and the last odometry while it was driven along (ns).
         self._begun = self._latest = 0
-        """The path and the progress along it. None: goals are sent."""
-        if isinstance(goals, Path):
-            self.path = PathProgress(goals)
         self.arrival = Arrival()
         """Determines which point of the robot is to arrive. The default is the axle centre."""
         self.robot: RobotOdometry | None = None

@@ -25,7 +25,7 @@ from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Task
 
-from diffdrive_jacobian.ros.rclpy_internals import entity_count, requires_wait_set
+from diffdrive_jacobian.ros.rclpy_internals import requires_wait_set
 
 LATEST = 0.02
 """Longest time that an event may wait behind others in the queue of the EventsExecutor (s)."""
@@ -147,3 +147,9 @@ class GuardedExecutor:
 
 def _nothing() -> None:
     """Do nothing."""
+
+
+def entity_count(node: Node) -> int:
+    """Return the number of timers, subscriptions, services, clients and waitables of a node."""
+    lists = (node.timers, node.subscriptions, node.services, node.clients, node.waitables)
+    return sum(len(list(entities)) for entities in lists)

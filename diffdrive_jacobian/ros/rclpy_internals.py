@@ -29,7 +29,6 @@ from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import HistoryPolicy, QoSProfile
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.task import Task
@@ -533,17 +532,6 @@ def events_executor(context: Context) -> Executor | None:
     # It enables the faulthandler, for which sys.stderr must be a file. In some tests it is not.
     with redirect_stderr(sys.__stderr__):
         return EventsExecutor(context=context)
-
-
-def entity_count(node: Node) -> int:
-    """Return the number of timers, subscriptions, services, clients and waitables of a node."""
-    lists = (node.timers, node.subscriptions, node.services, node.clients, node.waitables)
-    return sum(len(list(entities)) for entities in lists)
-
-
-def queue_depth(profile: QoSProfile) -> int:
-    """Return the largest number of messages that wait in a queue (sys.maxsize: it has no limit)."""
-    return sys.maxsize if profile.history == HistoryPolicy.KEEP_ALL else max(profile.depth, 1)
 
 
 def requires_wait_set(node: Node) -> bool:

@@ -24,7 +24,9 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 import diffdrive_jacobian
+from diffdrive_jacobian.lockstep._link import queue_depth
 from diffdrive_jacobian.ros import rclpy_internals as internals
+from diffdrive_jacobian.ros.guarded_executor import entity_count
 
 SECOND = 1_000_000_000
 PACKAGE = Path(diffdrive_jacobian.__file__).parent
@@ -263,18 +265,18 @@ def test_events_executor_runs_a_task_after_the_queued_events(events, node):
 
 
 def test_entities_of_a_node_are_counted(node):
-    before = internals.entity_count(node)
+    before = entity_count(node)
     node.create_timer(1.0, lambda: None)
     node.create_client(GetParameters, 'get')
-    assert internals.entity_count(node) == before + 2
+    assert entity_count(node) == before + 2
     node.create_subscription(String, 'words', [].append, 10)
     # With its QoS events.
-    assert internals.entity_count(node) > before + 2
+    assert entity_count(node) > before + 2
 
 
 def test_a_queue_without_a_limit_has_the_greatest_depth():
-    assert internals.queue_depth(QoSProfile(depth=3)) == 3
-    assert internals.queue_depth(QoSProfile(history=HistoryPolicy.KEEP_ALL)) == sys.maxsize
+    assert queue_depth(QoSProfile(depth=3)) == 3
+    assert queue_depth(QoSProfile(history=HistoryPolicy.KEEP_ALL)) == sys.maxsize
 
 
 def test_a_task_runs_to_the_next_await_when_it_is_called(ros):
