@@ -1,0 +1,72 @@
+"""The way of a message that doc/design.md lists: a message takes it, function by function."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+from geometry_msgs.msg import PoseStamped
+
+import diffdrive_jacobian
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+
+PAGE = Path(__file__).parents[2] / 'doc' / 'design.md'
+PACKAGE = Path(diffdrive_jacobian.__file__).parent
+LINE = re.compile(r'( *)(\w+/\w+\.py) +([\w.]+)')
+
+
+def listed():
+    """Return level, file and function of each line of the page."""
+    (block,) = re.findall(
+        r'<!-- way -->\n```text\n(.*?)```', PAGE.read_text(encoding='utf-8'), re.DOTALL
+    )
+    lines = [LINE.match(line) for line in block.splitlines()]
+    assert all(lines)
+    return [(len(one[1]) // 4, one[2], one[3]) for one in lines]
+
+
+def calls_during(run):
+    """Return the functions of the package that are called, each with those above it."""
+    found = []
+
+    def note(frame, event, _):
+        if event == 'call':
+            above = []
+            while frame is not None:
+                above.append(function_of(frame.f_code))
+                frame = frame.f_back
+            found.append(above)
+
+    sys.setprofile(note)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return found
+
+
+def function_of(code):
+    """Return file and name of a function; before Python 3.11 without its class."""
+    path = Path(code.co_filename)
+    file = str(path.relative_to(PACKAGE)) if PACKAGE in path.parents else ''
+    return file, getattr(code, 'co_qualname', code.co_name).replace('.<locals>', '')
+
+
+def test_an_odometry_takes_the_way_that_the_page_lists(lockstep):
+    lockstep.add(VirtualRobot())
+    lockstep.add(GoToGoal())
+    goal = PoseStamped()
+    goal.pose.position.x = goal.pose.position.y = 5.0
+    lockstep.publish('goal_pose', goal)
+    lockstep.run_for(2.0)
+    whole = hasattr(calls_during.__code__, 'co_qualname')
+    page = [(level, file, name if whole else name.split('.')[-1]) for level, file, name in listed()]
+    functions = {(file, name) for _, file, name in page}
+    taken = [
+        (sum(one in functions for one in above[1:]), *above[0])
+        for above in calls_during(lambda: lockstep.run_for(0.02))
+        if above[0] in functions
+    ]
+    assert taken == page
