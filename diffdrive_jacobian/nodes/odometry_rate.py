@@ -34,4 +34,4 @@ class OdometryRate:
         period = sorted(b - a for a, b in pairwise(self._times))[PERIODS // 2]
         before, self.hz = self.hz, 1e9 / period if period > 0 else math.inf
         self.measured = True
-        return not 0.8 < self.hz / before < 1.25
+        return self.hz != before and not 0.8 < self.hz / before < 1.25
