@@ -99,7 +99,7 @@ class GoToGoalParameters(TwistParameters):
     """Those of paths."""
     more_gains: tuple[Gain, ...] = ()
     """The gains of installed or given controllers that were chosen: parameters, too."""
-    gain_values: Mapping[str, float] = field(default_factory=dict)
+    gain_values: Mapping[str, float] = field(default_factory=dict, hash=False)
     """The values of those that are not among the fields below."""
 
     kp: float = _gain(KP)
