@@ -16,7 +16,7 @@ from diffdrive_jacobian.messages.topic_faults import (
     UNREAD,
 )
 from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TOPICS, Topic
-from diffdrive_jacobian.parameters.wheels import SAME_WHEELS, different_wheels
+from diffdrive_jacobian.parameters.wheels import SAME_WHEELS, Dimensions, different_wheels
 from diffdrive_jacobian.text import listed
 
 INFINITE = 2**63 - 1
@@ -90,8 +90,8 @@ class Participant:
     """Fully qualified name."""
     use_sim_time: bool | None = None
     """None: it did not report it."""
-    wheels: tuple[float, ...] | None = None
-    """Values of its parameters WHEELS (m). None: it has none."""
+    wheels: Dimensions | None = None
+    """Dimensions of its wheels. None: it has none."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

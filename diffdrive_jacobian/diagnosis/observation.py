@@ -34,7 +34,7 @@ from diffdrive_jacobian.messages.codecs import STAMP
 from diffdrive_jacobian.messages.names import full_name, node_of, type_name
 from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.nodes.same_wheels import wheels_of
-from diffdrive_jacobian.parameters.wheels import WHEELS
+from diffdrive_jacobian.parameters.wheels import WHEELS, Dimensions
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.ros.service_client import ServiceClient, ignore
 from diffdrive_jacobian.signals import Signals
@@ -86,7 +86,7 @@ class Observer(Node):  # type: ignore[misc]
         self._received: dict[str, _Received] = {}
         self._simulated = _ClockReceived()
         self._use_sim_time: dict[str, bool] = {}
-        self._wheels: dict[str, tuple[float, ...]] = {}
+        self._wheels: dict[str, Dimensions] = {}
         self._parameter_clients: dict[str, ServiceClient] = {}
         self._asked: set[str] = set()
         self.create_timer(PERIOD, self._look)

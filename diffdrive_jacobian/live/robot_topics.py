@@ -22,9 +22,9 @@ from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.nodes.goal_client import MESSAGES, goals_message
-from diffdrive_jacobian.ros.node import explaining_failure
 from diffdrive_jacobian.ros.rclpy_internals import Polled, waiting_messages
 from diffdrive_jacobian.ros.serialization import MAX_SIZE, ignoring_invalid
+from diffdrive_jacobian.ros.topic_errors import explaining_failure
 
 V = TypeVar('V')
 

@@ -1,8 +1,9 @@
 """The messages of the nodes: which fields are read, what value they make, and how it is written.
 
 A `Codec` belongs to a type of message. It reads serialized messages field by field, see `messages.cdr`,
-without their Python classes, so that bags are read where no ROS is installed, too. What it reads it
-checks, and what it writes it reads again as the same value.
+without their Python classes, so that bags are read where no ROS is installed, too. It checks what it
+reads, unless the value says otherwise. What it writes it reads again as the same value, but for the
+strings, which are those of a template.
 """
 
 from __future__ import annotations
@@ -183,7 +184,7 @@ class Motion(NamedTuple):
     twist: tuple[float, float]
     """`(v, omega)` in the body frame (m/s, rad/s)."""
     covariance: tuple[float, ...] = _ZERO_POSE_COVARIANCE
-    """Of x, y, theta, row by row; not checked, see `covariances.from_covariance`."""
+    """Of x, y, theta, row by row; not checked, see `conversion.from_covariance`."""
     twist_covariance: tuple[float, ...] = _ZERO_TWIST_COVARIANCE
     """Of v and omega, row by row; not checked."""
 

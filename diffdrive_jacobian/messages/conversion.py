@@ -1,8 +1,8 @@
 """Conversion between ROS messages and the quantities of the mathematics.
 
 Poses are `[x, y, theta]` (m, m, rad), twists `(v, omega)` (m/s, rad/s), times integer nanoseconds.
-Wheels are ordered left, right in messages, as is usual in ROS, and right, left in the mathematics. Only
-this module converts between these orders, and only it writes stamps.
+Wheels are ordered left, right in messages, as is usual in ROS, and right, left in the mathematics:
+`from_joints` and the values of `messages.codecs` convert between these orders.
 
 The `set_` functions fill an existing message. The `from_` functions take the fields of a message and
 check them. They raise MessageError, which reports the value and the range allowed. Which fields these
@@ -165,12 +165,12 @@ def from_joints(
     """
     if len(velocities) != len(joints):
         raise MessageError(
-            f'joint command must have a velocity for each name, got {len(joints)} names '
-            f'and {len(velocities)} velocities'
+            f'it must have a velocity for each joint, got {len(joints)} joints and '
+            f'{len(velocities)} velocities'
         )
     speeds = dict(zip(joints, velocities, strict=True))
     if any(joints.count(name) != 1 for name in names):
-        raise MessageError(f'joint command must name each of {quoted(names)} once, got {quoted(joints)}')
+        raise MessageError(f'it must name each of {quoted(names)} once, got {quoted(joints)}')
     left, right = (speeds[name] for name in names)
     if not (math.isfinite(left) and math.isfinite(right)):
         raise MessageError(f'wheel speeds must be finite, got left {left}, right {right}')

@@ -355,6 +355,7 @@ def check_readable(kind: Structure, field: str) -> None:
     length = LENGTH.fullmatch(field)
     found: FieldType = kind
     steps = (length[1] if length else field).split('.')
+    of_each = True
     for step in steps:
         name = step.removesuffix('[]')
         inner = dict(found.fields) if isinstance(found, Structure) else {}
@@ -365,15 +366,16 @@ def check_readable(kind: Structure, field: str) -> None:
             )
         found = inner[name]
         if step != name and isinstance(found, Sequence):
+            of_each = isinstance(found.element, Structure)
             found = found.element
     if length:
         readable = isinstance(found, Sequence)
     else:
         simple = found.element if isinstance(found, (Array, Sequence)) else found
-        readable = isinstance(simple, (Number, Text)) and field.count('[]') <= 1
+        readable = of_each and isinstance(simple, (Number, Text)) and field.count('[]') <= 1
     if not readable:
         raise ValueError(
             f'a field of {kind.short_name} must be a number, a string, an array or sequence of them, '
-            f"such a field of each element of one sequence ('goals[].pose'), or len() of a sequence, "
-            f"got '{field}'"
+            f"such a field of each element of one sequence ('goals[].pose.position.x'), or len() of a "
+            f"sequence, got '{field}'"
         )

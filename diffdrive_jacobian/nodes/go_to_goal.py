@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from action_msgs.msg import GoalInfo, GoalStatus
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
@@ -43,7 +42,7 @@ from diffdrive_jacobian.nodes.steering import STANDSTILL, Goal, Pursuit, Steerin
 from diffdrive_jacobian.nodes.stopping import rolls_on
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.ros.graph_faults import topic_check
-from diffdrive_jacobian.ros.node import ParameterizedNode
+from diffdrive_jacobian.ros.node import NO_CLOCK, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds
@@ -115,7 +114,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self.subscribe(PathMessage, 'path', self._on_path, codec=PATH, refused=refused)
         self.provide(Trigger, 'cancel_goal', self._on_cancel)
         # Without a frame: the twist is in the body frame, whose name this node does not know.
-        self._serialized = TWIST_STAMPED.writer(TwistStamped()) if stamped else TWIST.writer(Twist())
+        self._write_command = TWIST_STAMPED.writer(TwistStamped()) if stamped else TWIST.writer(Twist())
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._others = OtherDrivers(self, self._cmd_vel, self._on_other_driver)
         self._advised: set[str] = set()
@@ -149,7 +148,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 f"it must stay in frame '{printable(self._state.frame)}', got '{printable(state.frame)}'"
             )
         if goal is not None and now == 0:
-            raise MessageError('simulated time has not begun, nothing was received on /clock')
+            raise MessageError(NO_CLOCK)
         self._state = state
         if goal is None:
             return
@@ -169,13 +168,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             goal.pursuit, command = self._steering.command(before, state, now, self._rate.hz)
         except ValueError as error:
             self.log_event_warning('law', f'goal aborted: {error}')
-            self._stop_robot()
             self._end(GoalStatus.STATUS_ABORTED, 'aborted')
             return
-        if goal.pursuit is not before and goal.pursuit.has_missed_waypoint(before):
+        if goal.pursuit.missed and not before.missed:
             self._warn_of_waypoint(goal.pursuit)
         if command is None:
-            self._stop_robot()
             self._end(GoalStatus.STATUS_SUCCEEDED, f'reached{goal.pursuit.lateness(now)}')
             return
         self._publish_command(command, now)
@@ -184,10 +181,10 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         """Start executing a goal, now that the frame of the odometry and the pose are known."""
         try:
             self._match_frames(goal.pursuit.goal)
-            goal.pursuit = self._steering.begun(goal.pursuit, state.pose)
+            goal.pursuit = self._steering.begin(goal.pursuit, state.pose)
         except ValueError as error:
             self.log_event_warning('goal refused', f'goal refused: {error}')
-            self._end(GoalStatus.STATUS_ABORTED, 'refused')
+            self._end(GoalStatus.STATUS_ABORTED, 'refused', unless_silent=True)
             return False
         goal.executing = True
         self._publish_status(goal.info, GoalStatus.STATUS_EXECUTING)
@@ -223,25 +220,24 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     # --- Goals
 
     def _on_pose(self, route: Route) -> None:
-        self._receive('goal_pose', route, lambda: Goal(route.frame, np.array(route.poses)))
+        self._accept_or_refuse('goal_pose', route, Goal.through)
 
     def _on_goals(self, route: Route) -> None:
-        self._receive('goals', route, lambda: Goal(route.frame, np.array(route.poses)))
+        self._accept_or_refuse('goals', route, Goal.through)
 
     def _on_path(self, route: Route) -> None:
-        self._receive('path', route, lambda: Goal.along_path(route))
+        self._accept_or_refuse('path', route, Goal.along_path)
 
     def _on_invalid_goals(self, error: MessageError) -> None:
         assert isinstance(error, GoalError)
         self._refuse(self._new_info(error.stamp), error)
 
-    def _receive(self, topic: str, route: Route, read: Callable[[], Goal]) -> None:
-        """Accept or refuse goals."""
+    def _accept_or_refuse(self, topic: str, route: Route, goal_of: Callable[[Route], Goal]) -> None:
         for pose in route.poses:
             self.warn_of_integers(f'a pose on {topic}', *pose)
         info = self._new_info(route.stamp)
         try:
-            goal = read()
+            goal = goal_of(route)
             self._match_frames(goal)
         except ValueError as error:
             self._refuse(info, error)
@@ -272,7 +268,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if before is not None:
             self._publish_status(before.info, GoalStatus.STATUS_CANCELED)
         if before is not None and before.pursuit.goal.is_same_path(goal.pursuit.goal):
-            goal.pursuit = before.pursuit
+            goal.pursuit, goal.stale = before.pursuit, before.stale
         else:
             self._steering.reset()
             self._rate.begin()
@@ -285,9 +281,12 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self.log_event_info('goal accepted', f'goal accepted: {goal.pursuit.goal}')
         self._advise()
 
-    def _end(self, status: int, what: str) -> None:
-        """Stop the robot and end the active goal."""
-        if self._driving:
+    def _end(self, status: int, what: str, *, unless_silent: bool = False) -> None:
+        """Stop the robot and end the active goal.
+
+        `unless_silent`: only if it was this node that moved the robot. Others may drive it.
+        """
+        if self._driving or not unless_silent:
             self._stop_robot()
         if self._goal is not None:
             self._publish_status(self._goal.info, status)
@@ -302,28 +301,26 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if self._goal is None:
             response.message = 'no goal is active'
             return response
-        self._stop_robot()
         self._end(GoalStatus.STATUS_CANCELED, f'canceled{self._rolls_on()}')
         response.success, response.message = True, f'goal canceled, zero sent{self._rolls_on()}'
         return response
 
-    def _on_other_driver(self, names: str) -> None:
+    def _on_other_driver(self, names: list[str]) -> None:
         """Cancel the goal: whoever drives by hand takes over."""
-        # The zero of `_end`: or the robot might follow the last command of this node.
-        topic, hint = self._cmd_vel.topic_name, ''
+        topic, who, hint = self._cmd_vel.topic_name, ' or '.join(names), ''
         if self.get_fully_qualified_name() in names:
-            names, hint = f'another {names}', f'; {OF_SOMEBODY_ELSE}'
+            who, hint = f'another {who}', f'; {OF_SOMEBODY_ELSE}'
         self.log_event_warning(
             'other driver',
-            f'{names} drives the robot by {topic}, so the goal is canceled: send it again later, or '
+            f'{who} drives the robot by {topic}, so the goal is canceled: send it again later, or '
             f'remap the topic of the other one{hint}',
         )
-        self._end(GoalStatus.STATUS_CANCELED, 'canceled')
+        # Or the robot might follow the last command of this node.
+        self._end(GoalStatus.STATUS_CANCELED, 'canceled', unless_silent=True)
 
     def stop(self, why: str) -> None:
         """Stop the robot and cancel the goal, if there is one."""
         if self._goal is not None:
-            self._stop_robot()
             self._end(GoalStatus.STATUS_CANCELED, f'canceled: {why}{self._rolls_on()}')
             self.flush(self._cmd_vel)
             self.flush(self._status)
@@ -337,7 +334,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     def _publish_command(self, twist: tuple[float, float], now: int) -> None:
         """Publish a command at a time (ns)."""
         self._driving = twist != STANDSTILL
-        data = self._serialized(Command(twist, now))
+        data = self._write_command(Command(twist, now))
         self._others.sent(data)
         self._cmd_vel.publish(data)
 

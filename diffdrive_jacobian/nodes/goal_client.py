@@ -34,8 +34,9 @@ from diffdrive_jacobian.messages.codecs import (
 from diffdrive_jacobian.messages.conversion import MessageError, from_pose, from_time
 from diffdrive_jacobian.messages.goal_status import GoalFollower, GoalState
 from diffdrive_jacobian.messages.names import is_named, node_of
-from diffdrive_jacobian.ros.node import THROTTLE, explaining_failure
+from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
+from diffdrive_jacobian.ros.topic_errors import explaining_failure
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
 DRIVEN_POINT_PARAMETERS = ('controller', 'offset')
@@ -307,13 +308,13 @@ class GoalClient(Node):  # type: ignore[misc]
             return 'use_sim_time is true, but nothing is published on /clock'
         topic, status = self.resolve_topic_name(self.topic), self.resolve_topic_name('goal_status')
         readers, matched = self._reachable(), self.readers
-        if readers and matched < self._readers:
-            return f'{topic} has {matched} of {self._readers} subscriptions'
-        if matched < len(readers) or not self.controllers():
+        if not readers or not self.controllers():
             return (
                 f'no node is subscribed to {topic} and publishes {status}; is go_to_goal running, in '
                 'the same namespace and the same ROS_DOMAIN_ID?'
             )
+        if matched < (wanted := max(self._readers, len(readers))):
+            return f'{topic} has {matched} of {wanted} subscriptions'
         if self._relative and self.robot is None:
             return f'no odometry on {self.resolve_topic_name("odom")}, where the path is to begin'
         return None

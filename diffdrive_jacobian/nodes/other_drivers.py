@@ -24,11 +24,11 @@ REMEMBERED = 64
 class OtherDrivers:
     """Calls a function when another node sends a command that is not zero.
 
-    It is subscribed to the commands only once another node publishes them, and while it is active. So
-    its usual cost is that of remembering a command.
+    It is subscribed to the commands only once another node publishes them. So its usual cost is that of
+    remembering a command.
     """
 
-    def __init__(self, node: Node, publisher: Publisher, callback: Callable[[str], None]) -> None:
+    def __init__(self, node: Node, publisher: Publisher, callback: Callable[[list[str]], None]) -> None:
         """Start inactive.
 
         Args:
@@ -43,7 +43,7 @@ class OtherDrivers:
         self._callback = callback
         self._active = False
         self._subscribed = False
-        # Serialized, as they arrive again.
+        # Serialized, as they arrive again, each once.
         self._sent: deque[bytes] = deque(maxlen=REMEMBERED)
         self.sent = self._sent.append
         """Remember a serialized command of the node itself."""
@@ -84,14 +84,22 @@ class OtherDrivers:
         if self._graph.count_publishers(topic) < 2:
             return
         self._subscribed = True
+        # Those until now do not arrive.
+        self._sent.clear()
         # Best effort matches every publisher, whatever its quality of service.
         profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         kind = self._publisher.msg_type
         self._node.create_subscription(kind, topic, self._on_command, profile, raw=True)
 
     def _on_command(self, data: bytes) -> None:
-        if not self._active or data in self._sent:
-            return
+        try:
+            # One of them; another node may send the same command.
+            self._sent.remove(data)
+        except ValueError:
+            if self._active:
+                self._on_command_of_others(data)
+
+    def _on_command_of_others(self, data: bytes) -> None:
         try:
             v, omega = self._read(data).twist
         except MessageError:
@@ -100,4 +108,4 @@ class OtherDrivers:
         # A joystick that nobody touches may send zeros.
         if v or omega:
             names = publishers_of(self._node, self._publisher.topic_name, others=True)
-            self._callback(' or '.join(names) or 'another node')
+            self._callback(names or ['another node'])

@@ -260,6 +260,8 @@ class _Session:
         if self._wait(ANSWER_PATIENCE, lambda: None if client.status else missing, liveness):
             if signals.count:
                 return self._cancel(Result.INTERRUPTED)
+            # It may accept the goal later, when nobody follows it.
+            client.cancel()
             return self._result(Result.NO_ANSWER)
         lost = self._follow(liveness, controllers, timeout)
         if client.ended:

@@ -92,13 +92,13 @@ class RobotDefects:
         """
         self._know_truth()
         now, robot = self._simulation.present()
-        encoders, robot = self._encoders, robot.at(now)
-        if per_revolution is not None:
-            self._encoders = Encoders.at(robot, per_revolution)
-        elif encoders is not None:
-            self._encoders = None
-            pose = encoders.read(robot).pose
-            self._simulation.place(robot.placed(pose, robot.covariance, now, odometry_only=True))
+        before, robot = self._encoders, robot.at(now)
+        if before is not None:
+            pose = before.read(robot).pose
+            robot = robot.placed(pose, robot.covariance, now, odometry_only=True)
+        self._encoders = None if per_revolution is None else Encoders.at(robot, per_revolution)
+        if before is not None:
+            self._simulation.place(robot)
 
     def _know_truth(self) -> None:
         """Compute the true pose besides that of the odometry from now on."""

@@ -15,8 +15,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.messages.names import is_named, node_of
-from diffdrive_jacobian.parameters.wheels import WHEELS, different_wheels
-from diffdrive_jacobian.ros.service_client import ServiceClient, ignore
+from diffdrive_jacobian.parameters.wheels import WHEELS, Dimensions, different_wheels
+from diffdrive_jacobian.ros.service_client import ServiceClient
 
 PATIENCE = 5.0
 """Longest wait for an answer (s)."""
@@ -28,33 +28,43 @@ class SameWheels:
     """Asks the nodes that are subscribed to wheel speeds for their wheels, once."""
 
     def __init__(
-        self, node: Node, speeds: Publisher, wheels: tuple[float, ...], report: Callable[[str], None]
+        self,
+        node: Node,
+        speeds: Publisher,
+        wheels: Callable[[], Dimensions],
+        report: Callable[[str], None],
     ) -> None:
         """Ask nobody yet.
 
         Args:
             node: The node that publishes the speeds.
             speeds: Their publisher.
-            wheels: The values of its parameters WHEELS.
-            report: Receives what differs, with the remedy.
+            wheels: Returns the dimensions for which they are computed.
+            report: Receives what differs.
         """
         self._node, self._speeds, self._wheels, self._report = node, speeds, wheels, report
-        self._waiting: dict[str, ServiceClient] | None = None
+        self._clients: dict[str, ServiceClient] = {}
+        self._asked: set[str] = set()
+        self._answered: set[str] = set()
 
     def advance(self) -> bool:
         """Ask whoever is there, to be called with each command. Return whether this is done."""
-        if self._waiting is None:
-            if not self._speeds.get_subscription_count():
-                return False
-            self._waiting = self._clients()
-        for name, client in list(self._waiting.items()):
-            if client.ready:
-                del self._waiting[name]
+        if not self._clients:
+            # The name of a node may be discovered later than its subscription.
+            self._clients = self._find() if self._speeds.get_subscription_count() else {}
+        for name, client in self._clients.items():
+            if client.ready and name not in self._asked:
+                self._asked.add(name)
                 request = GetParameters.Request(names=[*WHEELS])
-                client.call(request, partial(self._on_answer, name), ignore)
-        return not self._waiting
+                client.call(request, partial(self._on_answer, name), partial(self._on_end, name))
+            client.advance()
+        if not self._clients or self._answered < self._clients.keys():
+            return False
+        for client in self._clients.values():
+            client.destroy()
+        return True
 
-    def _clients(self) -> dict[str, ServiceClient]:
+    def _find(self) -> dict[str, ServiceClient]:
         found = self._node.get_subscriptions_info_by_topic(self._speeds.topic_name)
         names = sorted({node_of(one) for one in found if is_named(one)})[:MOST]
         return {
@@ -63,14 +73,18 @@ class SameWheels:
         }
 
     def _on_answer(self, name: str, response: Any) -> None:
+        self._on_end(name)
         theirs = wheels_of(response)
-        if theirs is not None and (found := different_wheels(self._wheels, name, theirs)):
+        if theirs is not None and (found := different_wheels(self._wheels(), name, theirs)):
             self._report(found)
 
+    def _on_end(self, name: str, _: str = '') -> None:
+        self._answered.add(name)
 
-def wheels_of(response: Any) -> tuple[float, ...] | None:
+
+def wheels_of(response: Any) -> Dimensions | None:
     """Return the wheels in the answer to a request for WHEELS. None: the node has none."""
     values = response.values
     if len(values) != len(WHEELS) or any(one.type != ParameterType.PARAMETER_DOUBLE for one in values):
         return None
-    return tuple(float(one.double_value) for one in values)
+    return Dimensions.of(*(float(one.double_value) for one in values))

@@ -38,6 +38,11 @@ class Goal:
     """The path through them, with times a trajectory; None: they are driven to one by one."""
 
     @classmethod
+    def through(cls, route: Route) -> Goal:
+        """Return the poses to reach one by one."""
+        return cls(route.frame, np.array(route.poses))
+
+    @classmethod
     def along_path(cls, route: Route) -> Goal:
         """Return the path through all poses, or raise ValueError if fewer than two positions differ."""
         try:
@@ -74,10 +79,12 @@ class Pursuit:
     waypoints: Waypoints
     follower: PathFollower | None = None
     """The path that is followed; None: the waypoints are driven to one by one, or the last pose."""
-    begun: int = 0
+    first_step: int = 0
     """Time of the first step along the path (ns)."""
-    stepped: int = 0
+    last_step: int = 0
     """Time of the last step along the path (ns)."""
+    missed: bool = False
+    """Whether a waypoint was passed too far away: it and those after it are driven to one by one."""
 
     @classmethod
     def of(cls, goal: Goal) -> Pursuit:
@@ -89,15 +96,15 @@ class Pursuit:
         """Index of the pose that is driven to."""
         if self.follower is None:
             return self.waypoints.index
-        # A path through waypoints begins at the robot.
-        return max(self.follower.index - self.follower.passing, 0)
+        # A path through waypoints begins at the robot, which is no pose of the goal.
+        return max(self.follower.index - 1, 0) if self.follower.passing else self.follower.index
 
     def lateness(self, now: int) -> str:
         """Describe how much later than by its times a trajectory ended at a time (ns)."""
         path = self.goal.path
         if path is None or path.times is None:
             return ''
-        late = max((now - self.begun) / NANOSECONDS - path.duration, 0.0)
+        late = max((now - self.first_step) / NANOSECONDS - path.duration, 0.0)
         return f', {late:.1f} s later than by its times'
 
     def resumed(self) -> Pursuit:
@@ -106,12 +113,9 @@ class Pursuit:
 
     def without_path(self) -> Pursuit:
         """Return it off its path: the pose at the end, or the waypoints that remain, are driven to."""
-        return replace(self, follower=None, waypoints=Waypoints(self.goal.poses, self.index))
-
-    def has_missed_waypoint(self, before: Pursuit) -> bool:
-        """Return whether it has left the path of the step before at a waypoint that was not passed."""
-        left_path = before.follower is not None and self.follower is None
-        return left_path and self.waypoints.index + 1 < len(self.goal.poses)
+        poses, index = self.goal.poses, self.index
+        waypoints, missed = Waypoints(poses, index), index + 1 < len(poses)
+        return replace(self, follower=None, waypoints=waypoints, missed=missed)
 
 
 class Steering:
@@ -156,7 +160,7 @@ class Steering:
         if self._braking is not None:
             self._braking.sent(now, STANDSTILL)
 
-    def begun(self, pursuit: Pursuit, pose: Pose) -> Pursuit:
+    def begin(self, pursuit: Pursuit, pose: Pose) -> Pursuit:
         """Return a goal from where the robot is, or raise ValueError: a path begins too far away."""
         goal = pursuit.goal
         if pursuit.follower is not None:
@@ -192,11 +196,13 @@ class Steering:
         What a law raises, a ValueError, is passed on.
         """
         _, pose, twist = state
+        # For laws that remember something.
         self._law.now = self._path_law.now = now
         command = None
         if pursuit.follower is not None:
             pursuit, command = self._along_path(pursuit, pursuit.follower, pose, now)
         if command is None:
+            # Without a path, or no longer on it.
             waypoints, command = pursuit.waypoints.follow(
                 pose, self._law, self.arrival, self._parameters.kp, twist
             )
@@ -220,9 +226,11 @@ class Steering:
         """Compute the next command along a path; None: its end is reached, or a waypoint was missed."""
         # While the robot stands because odometry is missing, a trajectory waits.
         longest = self._parameters.odom_timeout or math.inf
-        dt = min(max(0, now - (pursuit.stepped or now)) / NANOSECONDS, longest)
+        dt = min(max(0, now - (pursuit.last_step or now)) / NANOSECONDS, longest)
         follower, command = follower.follow(pose, dt, self._path_law, self._law, self._path_settings)
-        pursuit = replace(pursuit, follower=follower, begun=pursuit.begun or now, stepped=now)
+        pursuit = replace(
+            pursuit, follower=follower, first_step=pursuit.first_step or now, last_step=now
+        )
         return pursuit.without_path() if command is None else pursuit, command
 
     def _braked(

@@ -58,7 +58,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         self._same_wheels: SameWheels | None = SameWheels(
             self,
             self._joint_command,
-            (parameters.wheel_radius, parameters.wheel_separation),
+            lambda: self.parameters.dimensions,
             lambda found: self.get_logger().warning(f'{found}; {SAME_WHEELS}'),
         )
         self._commands = Interleaving()
@@ -151,13 +151,13 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         """Publish zero wheel speeds, unless they are zero. Nobody is left to approach them."""
         if self._moving:
             self._timer.cancel()
-            self._target = STANDSTILL
+            self._target, self._profile = STANDSTILL, None
             self._publish(STANDSTILL, self.now())
             self.get_logger().info(f'the wheels are stopped: {why}')
             self.flush(self._joint_command)
 
     def parameters_changed(self, previous: WheelBridgeParameters) -> None:
-        """Change the timeout. Other parameters apply from the next command on."""
+        """Change the timeout. Dimensions apply to what is published next, limits to the next command."""
         self._configure()
         if self.parameters.cmd_vel_timeout != previous.cmd_vel_timeout:
             self._watchdog.change_timeout(self._timeout)

@@ -10,6 +10,7 @@ from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
 from diffdrive_jacobian.numerics.checks import Range, between
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, parameter
+from diffdrive_jacobian.parameters.wheels import WHEELS, Dimensions
 from diffdrive_jacobian.simulation.actuators import SHORTEST, AccelerationLimits, AxisLimits
 from diffdrive_jacobian.simulation.robot_model import RobotModel
 from diffdrive_jacobian.text import printable
@@ -209,6 +210,11 @@ class WheelParameters(TwistParameters):
     def check(self) -> None:
         """Raise ParameterError if the names of the wheels are equal."""
         differ('left_wheel_name', self.left_wheel_name, 'right_wheel_name', self.right_wheel_name)
+
+    @property
+    def dimensions(self) -> Dimensions:
+        """Dimensions of the wheels."""
+        return Dimensions.of(*(getattr(self, name) for name in WHEELS))
 
     @property
     def wheel_names(self) -> tuple[str, str]:

@@ -35,10 +35,16 @@ def robot_parameters(path: str) -> dict[str, Any]:
     """Return the parameters of virtual_robot in a ROS parameter file, by name.
 
     Raises:
-        UserError: The file cannot be read, is not a ROS parameter file, or has no such parameters.
+        UserError: The file cannot be read, is not a ROS parameter file, has no such parameters, or has
+            those of several robots.
     """
     found = sections(path)
     values: dict[str, Any] = {}
+    several = sorted({name for name, _ in found if name.endswith('/virtual_robot') and '*' not in name})
+    if len(several) > 1:
+        raise UserError(
+            f'--params-file must be for one virtual_robot, got {path} for {", ".join(several)}'
+        )
     for name, parameters in found:
         if is_shared(name) or name.endswith('/virtual_robot'):
             values.update(parameters)

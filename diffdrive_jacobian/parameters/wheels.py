@@ -2,31 +2,58 @@
 
 from __future__ import annotations
 
-WHEELS = ('wheel_radius', 'wheel_separation')
+import math
+from typing import NamedTuple
+
+WHEELS = (
+    'wheel_radius',
+    'right_wheel_radius_multiplier',
+    'left_wheel_radius_multiplier',
+    'wheel_separation',
+    'wheel_separation_multiplier',
+)
 """Parameters with the dimensions for which wheel speeds are computed, and with which they are driven."""
 SAME_WHEELS = 'give both nodes the same dimensions, as by the same --robot or --params-file'
-"""What to do about that."""
+"""What to do about other ones."""
 
 
-def different_wheels(computed: tuple[float, ...], name: str, driven: tuple[float, ...]) -> str:
+class Dimensions(NamedTuple):
+    """Dimensions of the wheels, the multipliers included (m)."""
+
+    right_radius: float
+    left_radius: float
+    separation: float
+
+    @classmethod
+    def of(cls, r: float, right: float, left: float, L: float, separation: float) -> Dimensions:
+        """Return those of the values of WHEELS."""
+        return cls(right * r, left * r, separation * L)
+
+
+def different_wheels(computed: Dimensions, name: str, driven: Dimensions) -> str:
     """Return what a node does whose wheels differ from those for which its speeds are computed.
 
     Empty: they are the same.
 
     Args:
-        computed: The values of WHEELS for which the speeds are computed (m).
+        computed: The dimensions for which the speeds are computed.
         name: Name of the node that drives by the speeds.
-        driven: Its values of WHEELS (m).
+        driven: Its dimensions.
     """
+    alike = all(one.right_radius == one.left_radius for one in (computed, driven))
+    names = 'wheel_radius' if alike else 'right wheel radius', 'left wheel radius', 'wheel_separation'
     differences = [
         f'{what} {there:g} m instead of {here:g} m'
-        for what, here, there in zip(WHEELS, computed, driven, strict=True)
-        if here != there
+        for what, here, there in zip(names, computed, driven, strict=True)
+        if not math.isclose(here, there) and not (alike and what == 'left wheel radius')
     ]
     if not differences:
         return ''
-    (r, L), (their_r, their_L) = computed, driven
+    right, left, separation = (there / here for here, there in zip(computed, driven, strict=True))
+    # Of the speeds of a straight line and of a turn in place.
+    curve = '' if math.isclose(right, left) else ', straight lines on a curve,'
     return (
         f'{name} has {" and ".join(differences)}, for which its wheel speeds are computed: it drives '
-        f'{their_r / r:.3g} times and turns {their_r / r * L / their_L:.3g} times as fast as commanded'
+        f'{(right + left) / 2.0:.3g} times{curve} and turns {(right + left) / 2.0 / separation:.3g} '
+        'times as fast as commanded'
     )

@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from itertools import chain
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
@@ -28,7 +27,6 @@ from rclpy.subscription import Subscription
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import Codec
 from diffdrive_jacobian.messages.conversion import MessageError, integer_warning
-from diffdrive_jacobian.messages.names import type_name
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError
 from diffdrive_jacobian.ros.graph_faults import (
     ALTERNATION_PATIENCE,
@@ -43,9 +41,9 @@ from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.parameters import declare, declare_new
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
-from diffdrive_jacobian.ros.rclpy_internals import log_info, parameter_overrides, reason, time_reader
+from diffdrive_jacobian.ros.rclpy_internals import log_info, time_reader
 from diffdrive_jacobian.ros.serialization import Interleaving, receiver
-from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.ros.topic_errors import explaining_failure
 
 P = TypeVar('P', bound=NodeParameters)
 V = TypeVar('V')
@@ -104,7 +102,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
     # --- For subclasses
 
     def parameters_changed(self, previous: P) -> None:
-        """React to new values in `parameters`, which may equal the previous ones."""
+        """React to new values in `parameters`."""
 
     def stop(self, why: str) -> None:
         """Stop what this node commands, and log why: it is destroyed, or time does not advance."""
@@ -116,12 +114,13 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
         Raises:
             ParameterError: The topic has another type in this process, or `qos_overrides` are invalid.
+                The node is destroyed.
         """
         self.watch(wrong_type(self, topic, message, subscribed=False), TYPE_PATIENCE, error=True)
         profile = QoSProfile(depth=10)
         if latched:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        with explaining_failure(self, message, topic):
+        with self._creating(message, topic):
             return self.create_publisher(
                 message,
                 topic,
@@ -168,7 +167,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         self.watch(wrong_type(self, topic, message, subscribed=True), TYPE_PATIENCE, error=True)
         if numbers is not None:
             self.watch(alternating_commands(self, topic, numbers), ALTERNATION_PATIENCE)
-        with explaining_failure(self, message, topic):
+        with self._creating(message, topic):
             return self.create_subscription(
                 message,
                 topic,
@@ -177,6 +176,16 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
                 raw=True,
             )
+
+    @contextmanager
+    def _creating(self, message: type, topic: str) -> Iterator[None]:
+        """Explain why a topic cannot be created, and leave no half of a node in the graph."""
+        try:
+            with explaining_failure(self, message, topic):
+                yield
+        except BaseException:
+            self.destroy_node()
+            raise
 
     def provide(self, service: Any, name: str, callback: Callable[[Any, Any], Any]) -> Service:
         """Create a service. Raise RuntimeError if its name is invalid."""
@@ -239,11 +248,11 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     def _apply_parameters(self, changes: list[Parameter]) -> None:
         previous = self.parameters
-        self.parameters = previous.changed({one.name: one.value for one in changes})
-        if self.parameters is previous:
-            return
-        self.parameters = declare_new(self, previous, self.parameters)
-        self.parameters_changed(previous)
+        self.parameters = new = previous.changed({one.name: one.value for one in changes})
+        # Declaring further ones calls this again, with the values that they have.
+        if new != previous:
+            self.parameters = declare_new(self, previous, new)
+            self.parameters_changed(previous)
 
     # --- Checks
 
@@ -282,59 +291,3 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 f'use_sim_time is true, but nothing came on /clock for {CLOCK_PATIENCE} s: this node '
                 'does nothing until it does; publish /clock or set use_sim_time to false'
             )
-
-
-@contextmanager
-def explaining_failure(node: Node, message: type, topic: str) -> Iterator[None]:
-    """Explain why rclpy cannot create a publisher or a subscription of a node.
-
-    Within a process Fast DDS refuses a topic of two types, which rclpy reports as "invalid allocator".
-    `qos_overrides` may be a combination that does not exist (RuntimeError), or a number that does not
-    fit the profile of the middleware (TypeError).
-
-    Raises:
-        ParameterError: The topic has another type in this process, or `qos_overrides` are invalid.
-    """
-    try:
-        yield
-    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
-        explanation = _explanation(node, message, node.resolve_topic_name(topic), error)
-        if explanation is None:
-            raise
-        raise ParameterError(explanation) from error
-
-
-def _explanation(node: Node, message: type, name: str, error: Exception) -> str | None:
-    """Return why a topic cannot be created; None: the error is not about its type or its QoS."""
-    wanted = type_name(message)
-    others: list[str] = []
-    if isinstance(error, RuntimeError):
-        types = dict(node.get_topic_names_and_types()).get(name, [])
-        others = [printable(other) for other in types if other != wanted]
-    if others:
-        used = {
-            type_name(endpoint.msg_type)
-            for endpoint in chain(node.publishers, node.subscriptions)
-            if endpoint.topic_name == name
-        }
-        if own := sorted(used - {wanted}):
-            return (
-                f'two topics of this node have the name {name}, one with type {wanted}, the other with '
-                f'{", ".join(own)}: remap them to different names'
-            )
-        stamped = 'Twist' in wanted and any('Twist' in other for other in others)
-        hint = ' (is enable_stamped_cmd_vel the same for both?)' if stamped else ''
-        return (
-            f'{name} must have one type within a process: this node uses {wanted}, another one '
-            f'{", ".join(others)}{hint}'
-        )
-    prefix = f'qos_overrides.{name}.'
-    given = [
-        f'{key.removeprefix(prefix)}: {override.value}'
-        for key, override in sorted(parameter_overrides(node).items())
-        if key.startswith(prefix)
-    ]
-    if not given:
-        return None
-    why = reason(error) if isinstance(error, RuntimeError) else 'a number is out of range'
-    return f'the qos_overrides of {name} are invalid: {why} (got {printable(", ".join(given))})'

@@ -11,7 +11,7 @@ import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import pairwise
 from typing import ClassVar, TypeVar
 
@@ -284,7 +284,8 @@ class Runner(NodeRunner):
     def _remove(self, node: Node) -> None:
         self._executor.remove_node(node)
         # The EventsExecutor lets go of it only then.
-        self._executor.spin_once(timeout_sec=0.0)
+        with suppress(ExternalShutdownException):
+            self._executor.spin_once(timeout_sec=0.0)
         node.destroy_node()
 
     def _spin_once(self) -> None:

@@ -79,6 +79,16 @@ def test_gains_are_declared_when_their_controller_is_chosen(lockstep, site):
     assert node.parameters.k_beta == -2.0
 
 
+def test_a_change_that_declares_gains_is_one_change(lockstep, site, monkeypatch):
+    site.install('polar')
+    node, changes = lockstep.add(make(GoToGoal)), []
+    monkeypatch.setattr(node, 'parameters_changed', changes.append)
+    assert change(node, controller='polar').successful
+    assert [one.controller for one in changes] == ['go_to_goal']
+    assert change(node, controller='polar').successful
+    assert len(changes) == 1
+
+
 def test_the_default_of_a_shared_gain_is_that_of_the_controller_chosen():
     own = replace(INTEGRAL, gains=(replace(KP, default=1.5), *INTEGRAL.gains[1:]))
     assert GoToGoalParameters().with_controller(own).at_start({}).kp == 1.5

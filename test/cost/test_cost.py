@@ -26,9 +26,9 @@ LIMITS = {
     # One step of a batch of 100 closed loops, with the equations of one robot on arrays.
     'batch': {'calls': 88, 'functions': 26, 'files': 7},
     # The start of a program: modules of the package, and all. A ROS installation may have fewer.
-    'virtual_robot': {'own modules': 57, 'modules': 500},
-    'go_to_goal': {'own modules': 74, 'modules': 500},
-    'wheel_bridge': {'own modules': 58, 'modules': 495},
+    'virtual_robot': {'own modules': 59, 'modules': 500},
+    'go_to_goal': {'own modules': 76, 'modules': 500},
+    'wheel_bridge': {'own modules': 59, 'modules': 495},
 }
 BYTECODES = {
     'lockstep': {(3, 10): 4400, (3, 11): 4520, (3, 12): 4245, (3, 13): 4035},

@@ -316,6 +316,8 @@ def test_a_field_that_cannot_be_read_is_an_error():
     for wrong in ('pose', 'header', 'pose.pose.position.q', 'header.stamp.sec.x', 'len(q)', ''):
         with pytest.raises(ValueError, match='a field of Odometry must be'):
             Reader(Odometry, [wrong])
+    with pytest.raises(ValueError, match='a field of Float64MultiArray must be'):
+        Reader(Float64MultiArray, ['data[]'])
     with pytest.raises(TypeError, match=r'a_msgs/One.text must not be a wide string'):
         Reader(Structure('a_msgs/One', (('number', Number('b')), ('text', Text(wide=True)))), ['number'])
 

@@ -11,8 +11,10 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Goals, Odometry
 from rcl_interfaces.msg import ParameterEvent
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
+from std_srvs.srv import Trigger
 from support.ros_messages import goal, goals, odometry, receive, value_of
 
 from diffdrive_jacobian.control import Arrival
@@ -237,6 +239,31 @@ def test_a_controller_that_does_not_answer_does_not_count(ros):
     ros.until(lambda: ros.peer.count_publishers('goal_status') == 2, 'both are discovered')
     result = send_goal([1.0, 0.0, 0.0], runner=Runner(ros.context, ros.executor), follow=False)
     assert result.acknowledged
+
+
+class MuteController(Node):
+    """Receives goals, and says nothing about them."""
+
+    def __init__(self, context):
+        super().__init__('mute', context=context)
+        self.heard = []
+        self.create_publisher(GoalStatus, 'goal_status', 1)
+        self.create_subscription(PoseStamped, 'goal_pose', lambda _: self.heard.append('goal'), 10)
+        self.create_service(Trigger, 'cancel_goal', self._on_cancel)
+
+    def _on_cancel(self, _, response):
+        self.heard.append('cancel')
+        return response
+
+
+def test_a_goal_without_an_answer_is_withdrawn():
+    """The controller may only be slow, and nobody would follow the goal."""
+    with in_lockstep() as runner:
+        mute = runner.add(lambda: MuteController(runner.context))
+        result = send_goal([1.0, 0.0, 0.0], runner=runner)
+        runner.settle()
+    assert result.result is Result.NO_ANSWER
+    assert mute.heard == ['goal', 'cancel']
 
 
 # --- Robots that have a goal and do not move

@@ -158,6 +158,37 @@ def test_driving_by_hand_cancels_the_goal(lockstep, add, node, capfd):
     assert 'drives the robot' not in said(capfd)
 
 
+def test_commands_of_others_that_equal_its_own_cancel_the_goal_too(lockstep, add, node, capfd):
+    """With a limit of the velocity many commands are the same bytes."""
+    add(VirtualRobot)
+    controller = add(GoToGoal, linear__x__max_velocity=0.2)
+    lockstep.publish('goals', goals(goal(50.0, 0.0)))
+    theirs = node.create_publisher(Twist, 'cmd_vel', 10)
+    lockstep.run_for(2.5)
+    assert controller.waypoint == 0
+    assert 'drives the robot' not in said(capfd)
+    theirs.publish(twist(0.2, 0.0))
+    lockstep.run_for(0.1)
+    assert controller.waypoint is None
+    assert '/lockstep drives the robot by /cmd_vel, so the goal' in said(capfd)
+
+
+def test_who_has_a_longer_name_is_somebody_else(lockstep, add, node, capfd):
+    add(VirtualRobot)
+    mine = add(GoToGoal)
+    lockstep.publish('goals', goals(goal(50.0, 0.0)))
+    theirs = node.create_publisher(Twist, 'cmd_vel', 10)
+    lockstep.run_for(1.2)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(other_drivers, 'publishers_of', lambda *_, **__: ['/robot2/go_to_goal'])
+        theirs.publish(twist(0.25, 0.0))
+        lockstep.run_for(0.1)
+    assert mine.waypoint is None
+    text = said(capfd)
+    assert '/robot2/go_to_goal drives the robot by /cmd_vel' in text
+    assert 'another ' not in text
+
+
 def test_a_controller_of_the_same_name_is_perhaps_that_of_somebody_else(lockstep, add, node, capfd):
     """Two people in one domain. Within a world names are different."""
     add(VirtualRobot)

@@ -206,6 +206,15 @@ def test_the_same_path_again_goes_on_where_the_robot_is(controller):
     assert controller.at(0.8, 0.0)[0] < 0.0
 
 
+def test_the_same_path_again_while_odometry_is_missing_is_resumed(lockstep, controller, capfd):
+    follow(controller, 0.0, 0.2)
+    lockstep.run_for(1.0)
+    assert 'robot stopped, waiting' in capfd.readouterr().err
+    controller.send(STRAIGHT)
+    assert controller.at(0.2, 0.0) == (0.2, 0.0)
+    assert 'odometry is received again' in capfd.readouterr().err
+
+
 def test_goal_and_path_replace_each_other_and_cancel_stops(lockstep, controller):
     controller.send(goal(1, 0, stamp=1))
     controller.at(0, 0)

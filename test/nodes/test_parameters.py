@@ -285,6 +285,9 @@ def test_a_tool_without_nodes_takes_the_parameters_of_the_robot_alone(written):
     for name in ('/a/virtual_robot', '/**', '"*"'):
         text = f'{name}: {{ros__parameters: {{linear: {{x: 1.0}}}}}}'
         assert robot_parameters(written(text)) == {'linear.x': 1.0}
+    two = '/a/virtual_robot: {ros__parameters: {x: 1.0}}\n/b/virtual_robot: {ros__parameters: {x: 2.0}}'
+    with pytest.raises(UserError, match=r'for one virtual_robot, .* for /a/virtual_robot, /b/'):
+        robot_parameters(written(two))
 
 
 # --- Unknown parameters

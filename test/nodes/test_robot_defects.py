@@ -103,6 +103,15 @@ def test_coarse_encoders_are_read_when_the_robot_reports(bench):
         bench.defects.set_encoders(0)
 
 
+def test_other_encoders_go_on_from_the_pose_of_those_before(bench):
+    bench.defects.set_encoders(4)
+    bench.now += SECOND // 3
+    before = bench.reported().pose_tuple
+    bench.defects.set_encoders(5)
+    assert bench.placed == [before]
+    assert bench.reported().pose_tuple == before
+
+
 def test_encoders_count_on_from_where_the_odometry_is_placed(bench):
     bench.defects.set_encoders(1000)
     bench.place(bench.robot.placed(np.array([5.0, 5.0, 0.0]), np.zeros((3, 3)), bench.now))

@@ -63,8 +63,8 @@ def test_what_a_differential_drive_cannot_do_is_ignored(lockstep, add):
 BAD_COMMANDS = [
     (twist(math.nan, 0.0), 'twist must be finite, got linear'),
     (twist(0.0, 1001.0), 'twist must be within 1000 m/s and 1000 rad/s'),
-    (JointState(name=WHEELS, velocity=[1.0]), 'for each name, got 2 names and 1 velocities'),
-    (JointState(name=WHEELS), 'got 2 names and 0 velocities'),
+    (JointState(name=WHEELS, velocity=[1.0]), 'for each joint, got 2 joints and 1 velocities'),
+    (JointState(name=WHEELS), 'got 2 joints and 0 velocities'),
     (JointState(name=['left_wheel_joint', 'other'], velocity=[1.0, 1.0]), "'other']"),
     (JointState(name=[*WHEELS, WHEELS[0]], velocity=[1.0, 1.0, -1.0]), 'must name each of'),
     (JointState(), 'must name each of'),

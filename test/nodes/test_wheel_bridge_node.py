@@ -169,17 +169,62 @@ def test_stop_leaves_the_wheels_standing_and_reports_it_once(lockstep, add, out,
     assert 'too' not in said
 
 
-@pytest.mark.parametrize(('radius', 'expected'), [(0.05, 0), (0.06, 1)])
-def test_a_robot_with_other_wheels_is_warned_of_once(lockstep, capfd, radius, expected):
-    robot = {'command_interface': 'wheels', 'wheel_radius': radius}
+@pytest.mark.parametrize(
+    ('robot', 'bridge', 'said'),
+    [
+        ({'wheel_radius': 0.05}, {'wheel_radius': 0.05}, None),
+        (
+            {'wheel_radius': 0.06},
+            {'wheel_radius': 0.05},
+            'wheel_radius 0.06 m instead of 0.05 m, for which its wheel speeds are computed: it drives '
+            '1.2 times and turns 1.2 times as fast as commanded; give both nodes the same dimensions',
+        ),
+        ({'wheel_separation': 0.32}, {'wheel_separation_multiplier': 2.0}, None),
+        ({}, {'wheel_separation_multiplier': 2.0}, 'wheel_separation 0.16 m instead of 0.32 m'),
+        (
+            {'right_wheel_radius_multiplier': 1.2},
+            {},
+            'right wheel radius 0.0396 m instead of 0.033 m, for which its wheel speeds are computed: '
+            'it drives 1.1 times, straight lines on a curve, and turns 1.1 times',
+        ),
+    ],
+)
+def test_a_robot_with_other_wheels_is_warned_of_once(lockstep, capfd, robot, bridge, said):
+    robot = {'command_interface': 'wheels', **robot}
     lockstep.add(VirtualRobot(parameter_overrides=overrides(robot)))
-    lockstep.add(WheelBridge(parameter_overrides=overrides({'wheel_radius': 0.05})))
-    for _ in range(3):
+    node = lockstep.add(WheelBridge(parameter_overrides=overrides(bridge)))
+    before = len(list(node.clients))
+    for _ in range(4):
         lockstep.publish('cmd_vel', twist(0.2))
         lockstep.run_for(0.1)
-    said = capfd.readouterr().err
-    assert said.count('/virtual_robot has wheel_radius 0.06 m instead of 0.05 m') == expected
-    assert said.count('1.2 times as fast as commanded; give both nodes the same dimensions') == expected
+    text = capfd.readouterr().err
+    assert text.count('/virtual_robot has ') == (said is not None)
+    assert said is None or said in text
+    # Nothing is left of the question.
+    assert len(list(node.clients)) == before
+
+
+def test_the_wheels_are_those_when_the_robot_answers(lockstep, capfd):
+    robot = {'command_interface': 'wheels', 'wheel_radius': 0.05}
+    bridge = lockstep.add(WheelBridge())
+    change(bridge, wheel_radius=0.05)
+    lockstep.add(VirtualRobot(parameter_overrides=overrides(robot)))
+    for _ in range(4):
+        lockstep.publish('cmd_vel', twist(0.2))
+        lockstep.run_for(0.1)
+    assert 'instead of' not in capfd.readouterr().err
+
+
+def test_after_a_stop_the_wheels_accelerate_from_rest(lockstep, add, out):
+    bridge = add(WheelBridge, linear__x__max_acceleration=0.5, cmd_vel_timeout=0.0)
+    lockstep.publish('cmd_vel', twist(0.5, 0.0))
+    lockstep.run_for(2.0)
+    bridge.stop('time stands still')
+    lockstep.settle()
+    assert speeds(out)[-1] == STOP
+    lockstep.publish('cmd_vel', twist(0.5, 0.0))
+    lockstep.run_for(0.02)
+    assert out[-1].velocity[0] * R == pytest.approx(0.01)
 
 
 def test_who_has_no_wheels_is_not_compared(lockstep, capfd):

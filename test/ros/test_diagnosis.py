@@ -29,6 +29,7 @@ from diffdrive_jacobian.diagnosis.machine import (
     environment,
     shared_memory,
 )
+from diffdrive_jacobian.parameters.wheels import Dimensions
 from diffdrive_jacobian.text import listed
 
 TWIST, STAMPED = 'geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped'
@@ -137,8 +138,8 @@ def test_wheels_that_differ_are_a_problem():
     )
 
     def nodes(radius, separation):
-        return Participant('/bridge', False, (0.05, 0.2)), Participant(
-            '/robot', False, (radius, separation)
+        return Participant('/bridge', False, Dimensions(0.05, 0.05, 0.2)), Participant(
+            '/robot', False, Dimensions(radius, radius, separation)
         )
 
     assert list(check_topics(graph(*speeds, nodes=nodes(0.05, 0.2)))) == []

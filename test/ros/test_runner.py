@@ -109,6 +109,26 @@ def test_every_node_is_stopped_before_any_is_destroyed():
         assert told == [('shutting down', True, 2)]
 
 
+def test_a_node_that_cannot_be_created_leaves_nothing_in_the_graph():
+    override = 'qos_overrides./odom.publisher.depth:=-1'
+    with (
+        ros_context(['test', '--ros-args', '-p', override]) as context,
+        running(context, isolated=True) as runner,
+    ):
+        with pytest.raises(UserError, match='qos_overrides of /odom are invalid'):
+            runner.add(lambda: VirtualRobot(context=context))
+        observer = runner.add(lambda: Node('observer', context=context))
+        assert observer.get_node_names() == ['observer']
+
+
+def test_a_node_is_removed_when_its_context_was_shut_down():
+    with ros_context(['test']) as context, running(context, isolated=True) as runner:
+        node = runner.add(lambda: VirtualRobot(context=context))
+        context.shutdown()
+        runner.remove(node)
+        assert not runner.spin(lambda: False, timeout=10.0)
+
+
 def start_robot(*arguments):
     """Start and stop a robot with ROS arguments."""
     with (
