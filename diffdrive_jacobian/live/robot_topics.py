@@ -127,13 +127,13 @@ class RobotTopics:
 
     def _use_twist(self, codec: Codec[Command]) -> None:
         self._twist = codec
-        self._serialized_twist = codec.writer(message_class(codec.type_name)())
+        self._write_twist = codec.writer(message_class(codec.type_name)())
 
     # --- Publishing
 
     def publish_twist(self, twist: tuple[float, float], now: int) -> None:
         """Publish a command, at a time (ns)."""
-        data = self._serialized_twist(Command(twist, now))
+        data = self._write_twist(Command(twist, now))
         self._publisher(message_class(self._twist.type_name), 'cmd_vel').publish(data)
 
     def publish(

@@ -177,8 +177,6 @@ class Motion(NamedTuple):
 
     stamp: int
     """(ns)"""
-    frame: str
-    """Frame of the pose."""
     pose: tuple[float, float, float]
     """`(x, y, theta)` (m, m, rad)."""
     twist: tuple[float, float]
@@ -187,6 +185,8 @@ class Motion(NamedTuple):
     """Of x, y, theta, row by row; not checked, see `conversion.from_covariance`."""
     twist_covariance: tuple[float, ...] = _ZERO_TWIST_COVARIANCE
     """Of v and omega, row by row; not checked."""
+    frame: str = ''
+    """Frame of the pose, as it was read."""
 
 
 class State(NamedTuple):
@@ -205,41 +205,41 @@ class Place(NamedTuple):
 
     stamp: int
     """(ns)"""
-    frame: str
-    """Frame of the pose."""
     pose: tuple[float, float, float]
     """`(x, y, theta)` (m, m, rad)."""
     covariance: tuple[float, ...] = _ZERO_POSE_COVARIANCE
     """As of a `Motion`."""
+    frame: str = ''
+    """Frame of the pose, as it was read."""
 
 
 def _motion(sec: int, nanosec: int, frame: str, *values: Any) -> Motion:
     *numbers, of_pose, of_twist = values
     return Motion(
         from_time(sec, nanosec),
-        frame,
         from_pose(*numbers[:6]),
         from_twist(*numbers[6:]),
         _planar(of_pose),
         _forward_and_yaw(of_twist),
+        frame,
     )
 
 
 def _motion_numbers(motion: Motion) -> tuple[float, ...]:
-    stamp, _, (x, y, theta), twist, covariance, twist_covariance = motion
+    stamp, (x, y, theta), twist, covariance, twist_covariance, _ = motion
     orientation = math.sin(theta / 2.0), math.cos(theta / 2.0)
     return (*divmod(stamp, NANOSECONDS), x, y, *orientation, *covariance, *twist, *twist_covariance)
 
 
 def _place_numbers(place: Place) -> tuple[float, ...]:
-    stamp, _, (x, y, theta), covariance = place
+    stamp, (x, y, theta), covariance, _ = place
     orientation = math.sin(theta / 2.0), math.cos(theta / 2.0)
     return (*divmod(stamp, NANOSECONDS), x, y, *orientation, *covariance)
 
 
 def _place(sec: int, nanosec: int, frame: str, *values: Any) -> Place:
     *pose, covariance = values
-    return Place(from_time(sec, nanosec), frame, from_pose(*pose), _planar(covariance))
+    return Place(from_time(sec, nanosec), from_pose(*pose), _planar(covariance), frame)
 
 
 _WRITTEN_PLACE = (
@@ -267,7 +267,7 @@ MOTION = Codec(
     'nav_msgs/msg/Odometry',
     ODOMETRY.fields[:-2],
     lambda sec, nanosec, frame, *values: Motion(
-        from_time(sec, nanosec), frame, from_pose(*values[:6]), from_twist(*values[6:])
+        from_time(sec, nanosec), from_pose(*values[:6]), from_twist(*values[6:]), frame=frame
     ),
 )
 """Odometry without its covariances."""

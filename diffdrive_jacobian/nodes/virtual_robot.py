@@ -6,6 +6,7 @@ The unicycle model is integrated exactly. The motion depends on the commands and
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,10 @@ from rclpy.clock import JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
-from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import (
     JOINT_STATE,
     ODOMETRY,
@@ -41,6 +42,7 @@ from diffdrive_jacobian.messages.conversion import (
     MessageError,
     from_covariance,
     plausible_twist,
+    set_time,
 )
 from diffdrive_jacobian.messages.topic_faults import GOALS_LOST, SEVERAL, UNPUBLISHED
 from diffdrive_jacobian.nodes.robot_defects import RobotDefects
@@ -85,8 +87,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         if drifts:
             self._ground_truth = self.advertise(Odometry, 'ground_truth')
         self._transforms = self._transform_broadcaster() if self.parameters.enable_odom_tf else None
-        self._commands = Interleaving()
-        commands: dict[str, Any] = {'called': 'command', 'numbers': self._commands}
+        self._numbers = Interleaving()
+        commands: dict[str, Any] = {'called': 'command', 'numbers': self._numbers}
         if self.parameters.command_interface == 'wheels':
             source = 'joint_command'
             self.subscribe(JointState, source, self._on_wheels, codec=JOINT_STATE, **commands)
@@ -166,8 +168,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _publish_start(self, robot: Robot) -> None:
         """Publish the pose and the time at which the odometry starts."""
-        place = Place(robot.stamp, self._frame, robot.pose_tuple, robot.covariance_tuple)
-        self._start_pose.publish(self._serialized_start(place))
+        place = Place(robot.stamp, robot.pose_tuple, robot.covariance_tuple)
+        self._start_pose.publish(self._write_start(place))
 
     def _on_tick(self) -> None:
         advanced = self._advance()
@@ -177,26 +179,24 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             self._first_clock.unregister()
             self._first_clock = None
         now, robot = advanced
-        truth = robot.at(now)
-        state = self.defects.reported(truth)
+        present = robot.at(now)
+        reported = self.defects.reported(present)
         odometry = Motion(
             now,
-            self._frame,
-            state.pose_tuple,
-            state.twist,
-            state.covariance_tuple,
-            state.twist_covariance_tuple(self._period),
+            reported.pose_tuple,
+            reported.twist,
+            reported.covariance_tuple,
+            reported.twist_covariance_tuple(self._period),
         )
-        self._odom.publish(self._serialized_odometry(odometry))
-        wheels = Wheels.of(now, self._wheel_names, state.wheel_speeds, state.wheel_angles)
-        self._joint_states.publish(self._serialized_joints(wheels))
+        self._odom.publish(self._write_odometry(odometry))
+        wheels = Wheels.of(now, self._wheel_names, reported.wheel_speeds, reported.wheel_angles)
+        self._joint_states.publish(self._write_joints(wheels))
         if self._ground_truth is not None:
-            motion = Motion(now, self._truth_frame, truth.true_pose_tuple, truth.true_twist)
-            self._ground_truth.publish(self._serialized_truth(motion))
+            truth = Motion(now, present.true_pose_tuple, present.true_twist)
+            self._ground_truth.publish(self._write_truth(truth))
         if self._transforms is not None:
-            messages.set_time(self._odometry.header.stamp, now)
-            messages.set_pose(self._odometry.pose.pose, state.pose)
-            self._transforms.sendTransform(transform_of(self._odometry))
+            frames = self._frame, self.parameters.base_frame_id
+            self._transforms.sendTransform(transform_of(odometry, *frames))
 
     # --- Commands
 
@@ -212,18 +212,18 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         """Apply a command at its stamp, or now if it has none."""
         now, robot = self.present()
         (v, omega), stamp = command
-        time = command_time(stamp, now, robot.stamp, robot.model.command_timeout) if stamp else now
+        time = command_time(stamp, now, robot.stamp, robot.model.command_timeout)
         if v or omega:
-            self._commands.count()
+            self._numbers.count()
             # Not a call for each message.
-            if min(abs(v) or 1.0, abs(omega) or 1.0) < SMALLEST:
+            if 0.0 < abs(v) < SMALLEST or 0.0 < abs(omega) < SMALLEST:
                 self.warn_of_integers('a command', v, omega)
         self._robot = robot.commanded((v, omega), time)
         self._publish_applied(self._robot)
 
     def _publish_applied(self, robot: Robot) -> None:
         """Publish the twist that the robot is to reach, with the time from which it follows it."""
-        self._applied.publish(self._serialized_command(Command(robot.target, robot.stamp)))
+        self._applied.publish(self._write_command(Command(robot.target, robot.stamp)))
 
     # --- Pose
 
@@ -312,20 +312,17 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         parameters = self.parameters
         self._model = parameters.model()
         self._period = 1.0 / parameters.publish_rate
-        self._frame, self._truth_frame = parameters.odom_frame_id, parameters.ground_truth_frame_id
-        self._odometry = Odometry(child_frame_id=parameters.base_frame_id)
-        truth = Odometry(child_frame_id=parameters.base_frame_id)
-        truth.header.frame_id = self._truth_frame
-        start, command = PoseWithCovarianceStamped(), TwistStamped()
-        self._odometry.header.frame_id = start.header.frame_id = self._frame
-        command.header.frame_id = parameters.base_frame_id
         self._wheel_names = parameters.wheel_names
+        self._frame = parameters.odom_frame_id
+        of_odometry, of_body = Header(frame_id=self._frame), Header(frame_id=parameters.base_frame_id)
+        of_truth = Header(frame_id=parameters.ground_truth_frame_id)
+        child = parameters.base_frame_id
+        self._write_odometry = ODOMETRY.writer(Odometry(header=of_odometry, child_frame_id=child))
+        self._write_truth = ODOMETRY.writer(Odometry(header=of_truth, child_frame_id=child))
+        self._write_start = POSE_WITH_COVARIANCE.writer(PoseWithCovarianceStamped(header=of_odometry))
+        self._write_command = TWIST_STAMPED.writer(TwistStamped(header=of_body))
         joints = JointState(name=[*self._wheel_names], position=[0.0, 0.0], velocity=[0.0, 0.0])
-        self._serialized_odometry = ODOMETRY.writer(self._odometry)
-        self._serialized_truth = ODOMETRY.writer(truth)
-        self._serialized_start = POSE_WITH_COVARIANCE.writer(start)
-        self._serialized_command = TWIST_STAMPED.writer(command)
-        self._serialized_joints = JOINT_STATE.writer(joints)
+        self._write_joints = JOINT_STATE.writer(joints)
 
     def _transform_broadcaster(self) -> Any | None:
         try:
@@ -336,10 +333,12 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         return TransformBroadcaster(self)
 
 
-def transform_of(odometry: Odometry) -> TransformStamped:
-    """Return the transform between the frames of an odometry message."""
-    message = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
-    position, translation = odometry.pose.pose.position, message.transform.translation
-    translation.x, translation.y = position.x, position.y
-    message.transform.rotation = odometry.pose.pose.orientation
+def transform_of(odometry: Motion, frame: str, child_frame: str) -> TransformStamped:
+    """Return the transform between the frames of an odometry."""
+    x, y, theta = odometry.pose
+    message = TransformStamped(header=Header(frame_id=frame), child_frame_id=child_frame)
+    set_time(message.header.stamp, odometry.stamp)
+    message.transform.translation.x, message.transform.translation.y = x, y
+    rotation = message.transform.rotation
+    rotation.z, rotation.w = math.sin(theta / 2.0), math.cos(theta / 2.0)
     return message

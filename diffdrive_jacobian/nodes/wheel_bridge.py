@@ -61,7 +61,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             lambda: self.parameters.dimensions,
             lambda found: self.get_logger().warning(f'{found}; {SAME_WHEELS}'),
         )
-        self._commands = Interleaving()
+        self._numbers = Interleaving()
         stamped = parameters.enable_stamped_cmd_vel
         kind, codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
         self.subscribe(
@@ -70,7 +70,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             self._on_command,
             codec=codec,
             called='command',
-            numbers=self._commands,
+            numbers=self._numbers,
         )
         readers = self._joint_command.get_subscription_count
         self.watch(topic_check(self, UNREAD, 'joint_command', readers))
@@ -95,7 +95,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         if self._same_wheels is not None and self._same_wheels.advance():
             self._same_wheels = None
         if v or omega:
-            self._commands.count()
+            self._numbers.count()
             self.warn_of_integers('a command on cmd_vel', v, omega)
         self._follow((v, omega), self._last, now)
 
@@ -131,7 +131,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
 
     def _publish(self, twist: tuple[float, float], stamp: int) -> None:
         self._twist = twist
-        self._joint_command.publish(self._serialized(self._model.wheel_speeds(*twist), stamp))
+        self._joint_command.publish(self._write_speeds(self._model.wheel_speeds(*twist), stamp))
 
     @property
     def _moving(self) -> bool:
@@ -169,11 +169,11 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         self._period = nanoseconds(1.0 / parameters.publish_rate)
         self._model = parameters.model()
         self._acceleration = parameters.acceleration_limits()
-        self._serialized: Callable[[tuple[float, float], int], bytes]
+        self._write_speeds: Callable[[tuple[float, float], int], bytes]
         speeds, names = [0.0, 0.0], parameters.wheel_names
         if self._joint_command.msg_type is JointState:
             joints = JOINT_STATE.writer(JointState(name=[*names], velocity=speeds))
-            self._serialized = lambda speeds, stamp: joints(Wheels.of(stamp, names, speeds))
+            self._write_speeds = lambda speeds, stamp: joints(Wheels.of(stamp, names, speeds))
         else:
             array = WHEEL_ARRAY.writer(Float64MultiArray(data=speeds))
-            self._serialized = lambda speeds, _: array(WheelArray.of(speeds))
+            self._write_speeds = lambda speeds, _: array(WheelArray.of(speeds))

@@ -107,12 +107,12 @@ WRITTEN = [
     (
         ODOMETRY,
         Odometry(),
-        st.builds(Motion, times, st.just(''), poses, pairs, spreads, st.tuples(*[numbers] * 4)),
+        st.builds(Motion, times, poses, pairs, spreads, st.tuples(*[numbers] * 4)),
     ),
     (
         POSE_WITH_COVARIANCE,
         PoseWithCovarianceStamped(),
-        st.builds(Place, times, st.just(''), poses, spreads),
+        st.builds(Place, times, poses, spreads),
     ),
     (
         JOINT_STATE,

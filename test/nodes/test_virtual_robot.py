@@ -23,10 +23,12 @@ from support.ros_messages import (
     twist,
     twist_stamped,
     twists,
+    value_of,
 )
 
 from diffdrive_jacobian.control import VelocityLimits, saturate
 from diffdrive_jacobian.kinematics import se2
+from diffdrive_jacobian.messages.codecs import ODOMETRY
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot, transform_of
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
@@ -204,7 +206,9 @@ def test_the_transform_repeats_the_odometry_where_tf2_ros_is_installed(lockstep,
     assert capfd.readouterr().err.count(words) == (0 if installed else 1)
     assert len(topics.odom) == 6
     assert len(received) == (6 if installed else 0)
-    transforms = [one.transforms[0] for one in received] or map(transform_of, topics.odom)
+    frames = 'odom', 'base_link'
+    computed = [transform_of(value_of(ODOMETRY, one), *frames) for one in topics.odom]
+    transforms = [one.transforms[0] for one in received] or computed
     for transform, odometry in zip(transforms, topics.odom, strict=True):
         assert transform.header == odometry.header
         assert transform.child_frame_id == odometry.child_frame_id
