@@ -175,21 +175,28 @@ class GoalFollower(Generic[G]):
 
     def _concerned(self, state: GoalState, stamp: Stamp) -> FollowedGoal[G]:
         """Return the goal that a status is about."""
-        followed = self._goals.get(stamp)
-        if followed is not None:
-            earlier = followed.earlier
-            if earlier is not None and not earlier.state.ended:
-                # The later one is accepted or refused first. If it was refused, the controller repeats
-                # the state of the earlier one.
-                answers = state in (GoalState.ACCEPTED, GoalState.ABORTED)
-                if followed.state.ended:
-                    answers = state is GoalState.ACCEPTED is not earlier.state
-                return followed if answers else earlier
-            if not (stamp == UNSTAMPED and followed.state.ended and state.active):
-                return followed
-        followed = FollowedGoal(None, stamp)
+        newest = self._goals.get(stamp)
+        if newest is not None and newest.earlier is not None and not newest.earlier.state.ended:
+            return self._one_of_two(newest, newest.earlier, state)
+        # An unstamped goal that has ended was another one.
+        ended_before = stamp == UNSTAMPED and newest is not None and newest.state.ended
+        if newest is not None and not (ended_before and state.active):
+            return newest
+        followed: FollowedGoal[G] = FollowedGoal(None, stamp)
         self._remember(followed)
         return followed
+
+    @staticmethod
+    def _one_of_two(
+        newest: FollowedGoal[G], earlier: FollowedGoal[G], state: GoalState
+    ) -> FollowedGoal[G]:
+        """Return which of two goals with the same stamp a status is about; the earlier one is active."""
+        if not newest.state.ended:
+            # The controller accepts or refuses the newest one before anything else.
+            return newest if state in (GoalState.ACCEPTED, GoalState.ABORTED) else earlier
+        # It has refused the newest one, and repeats the state of the earlier one.
+        repeated = state is not GoalState.ACCEPTED or earlier.state is GoalState.ACCEPTED
+        return earlier if repeated else newest
 
     def _remember(self, followed: FollowedGoal[G]) -> None:
         self._goals.pop(followed.stamp, None)

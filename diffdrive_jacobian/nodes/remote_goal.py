@@ -222,40 +222,56 @@ class _Session:
         self._progress = progress
 
     def run(self, patience: float, timeout: float, *, follow: bool, heading_matters: bool) -> GoalResult:
-        client, signals = self._client, self._signals
-        obstacle = self._wait(patience, client.obstacle)
+        """Find the controller, send the goal, and follow it."""
+        obstacle = self._wait(patience, self._client.obstacle)
         if obstacle is not None:
-            if signals.count:
-                return self._result(Result.INTERRUPTED)
-            return self._result(Result.NOT_SENT, reason=obstacle)
+            return self._not_sent(Result.NOT_SENT, obstacle)
         self._await_readers()
-        controllers = client.controllers()
+        controllers = self._client.controllers()
         parameters = HEADING_PARAMETERS if heading_matters else DRIVEN_POINT_PARAMETERS
-        liveness = Liveness(client, set(controllers.values()), parameters, self._runner.seconds)
-        silent = 'the controller is asked for its parameters'
-        obstacle = self._wait(
-            PARAMETER_PATIENCE,
-            lambda: None if liveness.answering.total() >= len(controllers) else silent,
-            liveness,
-        )
-        if obstacle is not None and signals.count:
+        liveness = Liveness(self._client, set(controllers.values()), parameters, self._runner.seconds)
+        if several := self._await_parameters(liveness, len(controllers)):
+            return self._not_sent(Result.SEVERAL, several)
+        if self._signals.count:
             return self._result(Result.INTERRUPTED)
-        # DDS lists one that was killed for up to 20 s: only those that answer count.
-        answering = list(liveness.answering.elements())
-        if len(answering) > 1:
-            return self._result(
-                Result.SEVERAL,
-                reason=f'several controllers answer, {printable(listed(answering))}: each would drive '
-                'the robot; stop all but one, or give each a namespace',
-            )
         self._use(liveness)
-        client.send()
+        self._client.send()
         for name, values in liveness.values.items():
             if heading_matters and ignores_heading(values):
                 self._progress.heading_ignored(name)
         if not follow:
             acknowledged = self._await_acknowledgement()
             return self._result(Result.SENT if acknowledged else Result.UNCONFIRMED)
+        return self._pursue(liveness, controllers, timeout)
+
+    def _not_sent(self, result: Result, reason: str) -> GoalResult:
+        """Return why the goal was not sent."""
+        if self._signals.count:
+            return self._result(Result.INTERRUPTED)
+        return self._result(result, reason=reason)
+
+    def _await_parameters(self, liveness: Liveness, controllers: int) -> str:
+        """Wait for the parameters of so many controllers. Return the error if several answer."""
+        silent = 'the controller is asked for its parameters'
+        self._wait(
+            PARAMETER_PATIENCE,
+            lambda: None if liveness.answering.total() >= controllers else silent,
+            liveness,
+        )
+        # DDS lists one that was killed for up to 20 s: only those that answer count.
+        answering = list(liveness.answering.elements())
+        if len(answering) < 2:
+            return ''
+        return (
+            f'several controllers answer, {printable(listed(answering))}: each would drive the robot; '
+            'stop all but one, or give each a namespace'
+        )
+
+    def _pursue(
+        self, liveness: Liveness, controllers: Mapping[bytes, str], timeout: float
+    ) -> GoalResult:
+        """Follow the goal to its end, or cancel it after a time (s) or on a signal."""
+        client, signals = self._client, self._signals
         missing = f'no answer on {client.resolve_topic_name("goal_status")}'
         if self._wait(ANSWER_PATIENCE, lambda: None if client.status else missing, liveness):
             if signals.count:

@@ -53,31 +53,48 @@ def overshoot_warnings(
     if actuators.immediate:
         return []
     v, omega = actuators.acceleration.v, actuators.acceleration.omega
-    found = []
-    for name, gain, speed, deceleration, unit, farthest in (
-        ('kv', kv, limits.max_v, -v.max_deceleration, 'm', math.inf),
-        (
-            *('kp', kp, max(-limits.min_omega, limits.max_omega)),
-            *(min(-omega.max_deceleration, omega.max_deceleration_reverse), 'rad', math.pi),
-        ),
-    ):
-        if gain is None:
-            continue
-        fastest = 2.0 * deceleration * max(1.0 / gain - actuators.reaction, 0.0)
-        if math.isnan(fastest):
-            # No limit of the acceleration, and no time to react.
-            fastest = 0.0
-        begin, speed = fastest / gain, min(speed, gain * farthest)
-        if speed <= fastest or begin >= farthest:
-            continue
-        best = 1.0 / (actuators.reaction + speed / (2.0 * deceleration))
-        what, further = ('goals', 'further away') if unit == 'm' else ('turns', 'by more')
-        which = f'{what} {further} than {begin:.3g} {unit}' if begin else f'all {what}'
-        # Without a limit of the velocity there are always goals that are too far away.
-        lower = f'{name} below {best:.3g}, ' if best > LEAST_SHARE * gain else ''
-        found.append(
-            f'{name} {gain:g} lets the robot drive too fast to stop, as it takes time to follow '
-            f'commands: {which} may be overshot; choose {lower}a lower limit of the velocity, or '
-            'stop_in_time'
-        )
-    return found
+    slowing_turns = min(-omega.max_deceleration, omega.max_deceleration_reverse)
+    fastest_turn = max(-limits.min_omega, limits.max_omega)
+    found = [
+        _overshoots('kv', kv, limits.max_v, -v.max_deceleration, actuators.reaction, math.inf),
+        _overshoots('kp', kp, fastest_turn, slowing_turns, actuators.reaction, math.pi),
+    ]
+    return [warning for warning in found if warning]
+
+
+def _overshoots(
+    name: str,
+    gain: float | None,
+    speed: float,
+    deceleration: float,
+    reaction: float,
+    farthest: float,
+) -> str:
+    """Return the warning about one gain; '': it asks for no more than the robot can do.
+
+    Args:
+        name: 'kv', a gain on a distance (m), or 'kp', one on a turn (rad).
+        gain: Its value (1/s); None: the law has none.
+        speed: Largest speed (m/s or rad/s).
+        deceleration: Largest deceleration (m/s^2 or rad/s^2).
+        reaction: Time until a command has an effect (s).
+        farthest: What is left at most (m or rad).
+    """
+    if gain is None:
+        return ''
+    fastest = 2.0 * deceleration * max(1.0 / gain - reaction, 0.0)
+    if math.isnan(fastest):
+        # No limit of the acceleration, and no time to react.
+        fastest = 0.0
+    begin, speed = fastest / gain, min(speed, gain * farthest)
+    if speed <= fastest or begin >= farthest:
+        return ''
+    best = 1.0 / (reaction + speed / (2.0 * deceleration))
+    what, further, unit = ('goals', 'further away', 'm') if name == 'kv' else ('turns', 'by more', 'rad')
+    which = f'{what} {further} than {begin:.3g} {unit}' if begin else f'all {what}'
+    # Without a limit of the velocity there are always goals that are too far away.
+    lower = f'{name} below {best:.3g}, ' if best > LEAST_SHARE * gain else ''
+    return (
+        f'{name} {gain:g} lets the robot drive too fast to stop, as it takes time to follow commands: '
+        f'{which} may be overshot; choose {lower}a lower limit of the velocity, or stop_in_time'
+    )
