@@ -186,6 +186,30 @@ class _Layout(NamedTuple):
     """Returns the fields among the unpacked values."""
 
 
+class _Format:
+    """What of a message is unpacked at once: the fields that are read, and the lengths on the way."""
+
+    def __init__(self) -> None:
+        self._codes = ['<']
+        self._end = 0
+        self.values = 0
+        """Number of values."""
+
+    def add(self, start: int, code: str, size: int, values: int = 1) -> int:
+        """Add values from an offset on, with the bytes before them skipped. Return the first index."""
+        if start > self._end:
+            self._codes.append(f'{start - self._end}x')
+        self._codes.append(code)
+        self._end = start + size
+        first, self.values = self.values, self.values + values
+        return first
+
+    def compiled(self, end: int) -> struct.Struct:
+        """Return it for messages of at least some bytes."""
+        self.add(end, '', 0, 0)
+        return struct.Struct(''.join(self._codes))
+
+
 class _Walk:
     """One pass over a message, which collects its layout. Raises struct.error where the bytes end."""
 
@@ -199,52 +223,45 @@ class _Walk:
         self._missing = set(fields)
         self._whole = whole
         self._offset = ENCAPSULATION
-        self._format = ['<2s']
-        self._formatted = 2
-        self._values = 1
-        self._lengths = [0]
+        self._format = _Format()
+        # The encapsulation, and then the length of each string and sequence.
+        self._lengths = [self._format.add(0, '2s', 2)]
         self._picks: dict[str, Any] = {field: [] for field in fields if '[]' in field}
         """Where the fields are among the unpacked values: an index, a slice, or a list of them."""
         self._texts: set[str] = set()
 
     def layout(self, kind: Structure) -> _Layout:
         self._walk(kind, '')
-        self._skip_to(self._offset)
-        compiled = struct.Struct(''.join(self._format))
+        compiled = self._format.compiled(self._offset)
         lengths = itemgetter(*self._lengths)
         expected = lengths(compiled.unpack_from(self._data))
         return _Layout(compiled.unpack_from, lengths, expected, self._picker())
 
     def _picker(self) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
+        """Return a function that returns the fields among the unpacked values."""
         picks = [self._picks[field] for field in self._fields]
-        of_each = any(isinstance(one, list) for one in picks)
-
-        def pick_each(values: tuple[Any, ...]) -> tuple[Any, ...]:
-            return tuple(
-                tuple(values[index] for index in one) if isinstance(one, list) else values[one]
-                for one in picks
-            )
-
-        # An itemgetter of one index returns no tuple.
-        pick: Callable[[tuple[Any, ...]], tuple[Any, ...]]
-        pick = pick_each if of_each or len(picks) < 2 else itemgetter(*picks)
         texts = [number for number, field in enumerate(self._fields) if field in self._texts]
-        if not texts:
-            return pick
+        simple = not any(isinstance(one, list) for one in picks)
+        # An itemgetter of one index returns no tuple.
+        if simple and not texts and len(picks) > 1:
+            return itemgetter(*picks)
         # A short message has few texts, and usually the same ones as before.
         convert = _converted_before if self._offset <= _MAX_REMEMBERED else _converted
-        if texts == [0] and len(picks) > 2 and not of_each:
-            # Such as a frame and numbers.
+        if simple and texts == [0] and len(picks) > 2:
+            # A frame and numbers, as of an odometry, without a loop.
             text, numbers = picks[0], itemgetter(*picks[1:])
             return lambda values: (convert(values[text]), *numbers(values))
 
-        def pick_texts(values: tuple[Any, ...]) -> tuple[Any, ...]:
-            picked = list(pick(values))
+        def pick(values: tuple[Any, ...]) -> tuple[Any, ...]:
+            picked = [
+                tuple(values[index] for index in one) if isinstance(one, list) else values[one]
+                for one in picks
+            ]
             for number in texts:
                 picked[number] = convert(picked[number])
             return tuple(picked)
 
-        return pick_texts
+        return pick
 
     @property
     def _done(self) -> bool:
@@ -254,7 +271,7 @@ class _Walk:
         match kind:
             case Structure():
                 if not kind.fields:
-                    self._take('', 1)
+                    self._advance(1)
                 for name, field in kind.fields:
                     if self._done:
                         return
@@ -262,13 +279,13 @@ class _Walk:
             case Number():
                 self._numbers(kind, 1, path)
             case Text():
-                self._text(path in self._missing)
-                self._found(path, self._values - 1, is_text=True)
+                if (index := self._text(path in self._missing)) is not None:
+                    self._found(path, index, is_text=True)
             case Array():
                 self._elements(kind.element, kind.count, path)
             case Sequence():
                 count = self._length()
-                self._found(f'len({path})', self._values - 1)
+                self._found(f'len({path})', self._lengths[-1])
                 if not self._done:
                     self._elements(kind.element, count, path)
 
@@ -295,73 +312,54 @@ class _Walk:
         unit = uniform_size(kind)
         if unit and not any(one.startswith(inner) for one in self._missing):
             # Such as points, which are doubles without padding.
-            if count:
-                self._align(unit)
-            self._take('', count * least_size(kind))
+            self._advance(count * least_size(kind), unit if count else 1)
             return
         if count > self._most:
             raise _ManyElementsError
         self._spend(count)
         if isinstance(kind, Text):
-            first, wanted = self._values, path in self._missing
+            first, wanted = self._format.values, path in self._missing
             for _ in range(count):
                 self._text(wanted)
             # Each string comes after its length.
-            self._found(path, slice(first + 1, self._values, 2), is_text=True)
+            self._found(path, slice(first + 1, self._format.values, 2), is_text=True)
             return
         for _ in range(count):
             self._walk(kind, inner)
         self._missing.difference_update([one for one in self._missing if one.startswith(inner)])
 
     def _numbers(self, kind: Number, count: int, path: str, *, many: bool = False) -> None:
-        wanted = path in self._missing
-        first = self._values
-        if wanted:
+        start = self._advance(count * kind.size, kind.size if count else 1)
+        if path in self._missing:
             self._spend(count)
-        if count:
-            self._align(kind.size)
-        self._take(f'{count}{kind.code}' if wanted else '', count * kind.size)
-        if wanted:
-            self._values += count
-            self._found(path, slice(first, self._values) if many else first)
+            first = self._format.add(start, f'{count}{kind.code}', count * kind.size, count)
+            self._found(path, slice(first, first + count) if many else first)
+
+    def _text(self, wanted: bool) -> int | None:
+        """Pass a string. Return its index among the values if it is wanted."""
+        size = self._length()
+        start = self._advance(size)
+        return self._format.add(start, f'{size}s', size) if wanted else None
+
+    def _length(self) -> int:
+        """Return the length of a string or a sequence, which is among the values."""
+        start = self._advance(COUNT.size, COUNT.size)
+        (length,) = struct.unpack_from('<I', self._data, start)
+        self._lengths.append(self._format.add(start, 'I', COUNT.size))
+        return int(length)
+
+    def _advance(self, size: int, alignment: int = 1) -> int:
+        """Pass some bytes. Return where they begin."""
+        start = self._offset + (ENCAPSULATION - self._offset) % alignment
+        self._offset = start + size
+        if self._offset > len(self._data):
+            raise struct.error('the bytes end within the message')
+        return start
 
     def _spend(self, count: int) -> None:
         self._budget -= count
         if self._budget < 0:
             raise LongMessageError('it has more values than are read of one message')
-
-    def _text(self, wanted: bool) -> None:
-        size = self._length()
-        self._take(f'{size}s' if wanted else '', size)
-        if wanted:
-            self._values += 1
-
-    def _length(self) -> int:
-        self._align(COUNT.size)
-        (length,) = struct.unpack_from('<I', self._data, self._offset)
-        self._lengths.append(self._values)
-        self._take('I', COUNT.size)
-        self._values += 1
-        return int(length)
-
-    def _take(self, code: str, size: int) -> None:
-        """Advance by a value, which is unpacked unless its format is empty."""
-        start = self._offset
-        self._offset += size
-        if self._offset > len(self._data):
-            raise struct.error('the bytes end within the message')
-        if code:
-            self._skip_to(start)
-            self._format.append(code)
-            self._formatted = self._offset
-
-    def _align(self, size: int) -> None:
-        self._offset += (ENCAPSULATION - self._offset) % size
-
-    def _skip_to(self, offset: int) -> None:
-        if offset > self._formatted:
-            self._format.append(f'{offset - self._formatted}x')
-            self._formatted = offset
 
 
 def _converted(raw: Any) -> Any:
@@ -410,18 +408,20 @@ class Writer:
         runs = _runs(encoder, fields)
         content = bytes(encoder.buffer)
         # All is packed at once: what does not change as strings of bytes, between the runs of numbers.
+        total = sum(run.numbers for run in runs)
         constants: list[bytes] = []
-        layout, end, order, count = '<', 0, [], 0
+        layout, end, order, first = '<', 0, [], 0
         for run in runs:
-            order += [-1 - len(constants), *range(count, count + run.numbers)]
+            order += [total + len(constants), *range(first, first + run.numbers)]
             constants.append(content[end : run.start])
             layout += f'{run.start - end}s{run.format}'
-            end, count = run.end, count + run.numbers
-        order += [-1 - len(constants), -2 - len(constants)]
+            end, first = run.end, first + run.numbers
+        # With an empty one at the end: an itemgetter of one index returns no tuple.
+        order += [total + len(constants), total + len(constants) + 1]
         constants += [content[end:], b'']
         layout += f'{len(content) - end}s0s'
-        self._numbers, self._count = numbers, count
-        self._constants, self._in_order = tuple(reversed(constants)), itemgetter(*order)
+        self._numbers, self._count = numbers, total
+        self._constants, self._in_order = tuple(constants), itemgetter(*order)
         self._pack = struct.Struct(layout).pack
 
     def __call__(self, value: Any) -> bytes:

@@ -47,10 +47,9 @@ from diffdrive_jacobian.messages.conversion import (
 from diffdrive_jacobian.messages.topic_faults import GOALS_LOST, SEVERAL, UNPUBLISHED
 from diffdrive_jacobian.nodes.robot_defects import RobotDefects
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
-from diffdrive_jacobian.ros.graph_faults import topic_check
+from diffdrive_jacobian.ros.graph_faults import Interleaving, topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
-from diffdrive_jacobian.ros.serialization import Interleaving
 from diffdrive_jacobian.ros.watchdog import command_time
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable

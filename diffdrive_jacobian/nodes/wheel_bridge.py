@@ -23,10 +23,9 @@ from diffdrive_jacobian.messages.topic_faults import UNREAD
 from diffdrive_jacobian.nodes.same_wheels import SameWheels
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
 from diffdrive_jacobian.parameters.wheels import SAME_WHEELS
-from diffdrive_jacobian.ros.graph_faults import topic_check
+from diffdrive_jacobian.ros.graph_faults import Interleaving, topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import restart_timer
-from diffdrive_jacobian.ros.serialization import Interleaving
 from diffdrive_jacobian.ros.watchdog import Watchdog, command_time
 from diffdrive_jacobian.simulation.actuators import ramp
 from diffdrive_jacobian.simulation.robot import STANDSTILL

@@ -20,7 +20,6 @@ from diffdrive_jacobian.messages.names import node_of, type_name
 from diffdrive_jacobian.messages.topic_faults import ALTERNATING, TopicFault
 from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.ros.rclpy_internals import graph_changed
-from diffdrive_jacobian.ros.serialization import Interleaving
 from diffdrive_jacobian.text import printable
 
 Check: TypeAlias = Callable[[], str | None]
@@ -133,6 +132,34 @@ def topic_check(
         return fault.logged(topic, TOPICS[name], publishers_of(node, topic))
 
     return check
+
+
+class Interleaving:
+    """Detects several publishers whose messages alternate, by the sequence numbers of the messages.
+
+    The numbers of one publisher increase. Where messages of two of them alternate, they fall again and
+    again. A publisher that is restarted lets them fall once.
+    """
+
+    def __init__(self) -> None:
+        """Start without messages."""
+        self.number: int | None = None
+        """Sequence number of the present message. None: the middleware has none."""
+        self._last = -1
+        self._falls = 0
+
+    def count(self) -> None:
+        """Count the present message."""
+        number = self.number
+        if number is not None:
+            if number <= self._last:
+                self._falls += 1
+            self._last = number
+
+    def falls(self) -> int:
+        """Return how often the numbers did not increase since the last call."""
+        falls, self._falls = self._falls, 0
+        return falls
 
 
 def alternating_commands(node: Node, name: str, commands: Interleaving) -> Check:

@@ -30,9 +30,9 @@ from diffdrive_jacobian.ros.rclpy_internals import requires_wait_set
 LATEST = 0.02
 """Longest time that an event may wait behind others in the queue of the EventsExecutor (s)."""
 SAMPLE_EVENTS = 64
-"""The wait is measured once for this many events, since a task takes as long as an event,"""
+"""Number of events after which the wait is measured again: a task takes as long as an event."""
 SAMPLE_PERIOD = 0.1
-"""or for the events of this time, whichever comes first (s)."""
+"""Time after which it is measured again, if there are fewer events (s)."""
 FEWEST = 8
 """The wait never counts if it was behind no more events than this."""
 TASK_PERIOD = 0.01

@@ -32,6 +32,7 @@ from diffdrive_jacobian.ros.graph_faults import (
     ALTERNATION_PATIENCE,
     MAX_AGE,
     TYPE_PATIENCE,
+    Interleaving,
     LastingFault,
     SharedGraph,
     alternating_commands,
@@ -42,7 +43,7 @@ from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.parameters import declare, declare_new
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.rclpy_internals import log_info, time_reader
-from diffdrive_jacobian.ros.serialization import Interleaving, receiver
+from diffdrive_jacobian.ros.serialization import receiver
 from diffdrive_jacobian.ros.topic_errors import explaining_failure
 
 P = TypeVar('P', bound=NodeParameters)

@@ -143,8 +143,6 @@ def report_unknown(nodes: Sequence[Node], others: Iterable[Node] = ()) -> None:
     if not unknown:
         return
     # Slow to import.
-    import difflib
-
     from diffdrive_jacobian.parameters.nodes import NODE_PARAMETERS
 
     ours = {name for one in NODE_PARAMETERS for name in one.declared()}
@@ -153,17 +151,26 @@ def report_unknown(nodes: Sequence[Node], others: Iterable[Node] = ()) -> None:
     shared = set().union(*(_shared(node.context) for node in nodes))
     given = set().union(*(_given(node.context) for node in nodes))
     for name, node in sorted(unknown.items()):
-        close = [one for one in known if one.lower() == name.lower()]
-        close = close or difflib.get_close_matches(name, known, n=1)
-        if not close and len(name) <= SHORT:
-            close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+        close = _resembling(name, known)
         if name in shared and (name in ours or not close):
             continue
-        hint = ' or '.join(f"'{one}'" for one in sorted(close))
-        hint = f'did you mean {hint}?' if close else f'see {" or ".join(programs)}'
+        meant = ' or '.join(f"'{one}'" for one in sorted(close))
+        hint = f'did you mean {meant}?' if close else f'see {" or ".join(programs)}'
         if name in given and name not in _later_gains():
             raise ParameterError(f"no node of this program has the parameter '{name}'; {hint}")
         node.get_logger().warning(f"unknown parameter '{name}' is ignored; {hint}")
+
+
+def _resembling(name: str, known: Sequence[str]) -> list[str]:
+    """Return the known names that were probably meant."""
+    # Slow to import.
+    import difflib
+
+    close = [one for one in known if one.lower() == name.lower()]
+    close = close or difflib.get_close_matches(name, known, n=1)
+    if not close and len(name) <= SHORT:
+        close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    return close
 
 
 def _later_gains() -> set[str]:

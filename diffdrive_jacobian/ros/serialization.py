@@ -10,6 +10,7 @@ from rclpy.serialization import deserialize_message
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import Codec
 from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.ros.graph_faults import Interleaving
 from diffdrive_jacobian.ros.rclpy_internals import request_message_info
 
 V = TypeVar('V')
@@ -17,34 +18,6 @@ V = TypeVar('V')
 MAX_SIZE = 1 << 20
 """Size of the largest message that clients of our nodes decode (bytes). rclpy would take minutes for a
 Goals message of 1.5 million poses."""
-
-
-class Interleaving:
-    """Detects several publishers whose messages alternate, by the sequence numbers of the messages.
-
-    The numbers of one publisher increase. Where messages of two of them alternate, they fall again and
-    again. A publisher that is restarted lets them fall once.
-    """
-
-    def __init__(self) -> None:
-        """Start without messages."""
-        self.number: int | None = None
-        """Sequence number of the present message. None: the middleware has none."""
-        self._last = -1
-        self._falls = 0
-
-    def count(self) -> None:
-        """Count the present message."""
-        number = self.number
-        if number is not None:
-            if number <= self._last:
-                self._falls += 1
-            self._last = number
-
-    def falls(self) -> int:
-        """Return how often the numbers did not increase since the last call."""
-        falls, self._falls = self._falls, 0
-        return falls
 
 
 def receiver(
