@@ -11,9 +11,10 @@ from diffdrive_jacobian.messages.conversion import MAX_SPEED
 from diffdrive_jacobian.numerics.checks import Range, between
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, parameter
 from diffdrive_jacobian.parameters.wheels import WHEELS, Dimensions
-from diffdrive_jacobian.simulation.actuators import SHORTEST, AccelerationLimits, AxisLimits
+from diffdrive_jacobian.simulation.actuators import SHORTEST, AccelerationLimits, Actuators, AxisLimits
 from diffdrive_jacobian.simulation.robot_model import RobotModel
 from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import nanoseconds
 
 _SMALLEST = 1e-200
 SPEED = between(0.0, MAX_SPEED)
@@ -163,6 +164,11 @@ class TwistParameters(NodeParameters):
         As in diff_drive_controller an axis without `max_acceleration` has none at all.
         """
         return AccelerationLimits(v=self._axis('linear_x'), omega=self._axis('angular_z'))
+
+    def actuators_with(self, lag: float, delay: float) -> Actuators:
+        """Return how commands are followed, with a lag and a delay (s)."""
+        limits = self.acceleration_limits()
+        return Actuators(acceleration=limits, lag=lag, delay=nanoseconds(delay))
 
     def _axis(self, axis: str) -> AxisLimits:
         forward, slowing, reverse, slowing_reverse = (getattr(self, f'{axis}_{name}') for name in _RATES)

@@ -41,8 +41,8 @@ from diffdrive_jacobian.parameters.declaration import (
     ParameterError,
     parameter,
 )
+from diffdrive_jacobian.parameters.more_gains import MoreGains, description
 from diffdrive_jacobian.simulation.actuators import Actuators
-from diffdrive_jacobian.time_units import nanoseconds
 
 C = TypeVar('C', bound=ControlLaw)
 
@@ -63,12 +63,8 @@ def _controller(default: str, choices: Controllers[Any]) -> Any:
     )
 
 
-def _description(gain: Gain) -> str:
-    return f'{gain.description} [{gain.unit}].' if gain.unit else f'{gain.description}.'
-
-
 def _gain(gain: Gain) -> Any:
-    return parameter(gain.default, _description(gain), gain.range)
+    return parameter(gain.default, description(gain), gain.range)
 
 
 def _stopped(what: str, unit: str) -> Any:
@@ -97,10 +93,8 @@ class GoToGoalParameters(TwistParameters):
     """The controllers that can be chosen."""
     path_controllers: Controllers[PathController] = ALL_PATH_CONTROLLERS
     """Those of paths."""
-    more_gains: tuple[Gain, ...] = ()
-    """The gains of installed or given controllers that were chosen: parameters, too."""
-    gain_values: Mapping[str, float] = field(default_factory=dict, hash=False)
-    """The values of those that are not among the fields below."""
+    more_gains: MoreGains = field(default_factory=MoreGains)
+    """The gains of given or installed controllers that were chosen: parameters, too."""
 
     kp: float = _gain(KP)
     kv: float = _gain(KV)
@@ -166,9 +160,9 @@ class GoToGoalParameters(TwistParameters):
 
     def __getattr__(self, name: str) -> float:
         """Return a gain that is not among the fields: a law asks for each by its name."""
-        values: Mapping[str, float] = {} if name == 'gain_values' else self.gain_values
-        if name in values:
-            return values[name]
+        # Not while the fields are set.
+        if name != 'more_gains' and name in self.more_gains.values:
+            return self.more_gains.values[name]
         raise AttributeError(f'{type(self).__name__} has no attribute {name!r}')
 
     def with_controller(self, controller: Controller) -> GoToGoalParameters:
@@ -187,71 +181,42 @@ class GoToGoalParameters(TwistParameters):
 
     def declared(self) -> dict[str, Parameter]:
         """Return the parameters by their ROS names, with the gains of the controllers."""
-        found = dict(TwistParameters.declared(self))
+        found = {**TwistParameters.declared(self), **self.more_gains.declared()}
         for known in (self.controllers, self.path_controllers):
             found[known.parameter] = replace(found[known.parameter], choices=known)
-        for gain in self.more_gains:
-            found[gain.name] = Parameter(
-                name=gain.name,
-                field=gain.name,
-                default=gain.default,
-                description=_description(gain),
-                within=gain.range,
-            )
         return found
 
     def changed(self, values: Mapping[str, Any]) -> GoToGoalParameters:
         """Return the parameters with new values by their ROS names, as `NodeParameters.changed`.
 
         The gains of controllers that are chosen become parameters, and stay. Raises ParameterError, too,
-        if one cannot be loaded, or if a gain has the name of something else, or another range than the
-        gain of that name.
+        if one cannot be loaded, or its gains cannot be parameters.
         """
         before = self._with_gains(values)
         known = before.declared()
         given = {name: known[name].converted(value) for name, value in values.items() if name in known}
         if before is self and not given:
             return self
-        more = {name: given.pop(name) for name in [*given] if name in before.gain_values}
-        fields = {known[name].field: value for name, value in given.items()}
-        return replace(before, gain_values={**before.gain_values, **more}, **fields)
+        more = before.more_gains.changed(given)
+        fields = {known[name].field: value for name, value in given.items() if name not in more.values}
+        return replace(before, more_gains=more, **fields)
 
     def at_start(self, values: Mapping[str, Any]) -> GoToGoalParameters:
         """Return these defaults with those of the controllers, and the values that the user gave."""
         before = self._with_gains(values)
-        own = {gain.name: gain.default for gain in before.more_gains}
+        own = {gain.name: gain.default for gain in before.more_gains.gains}
         return before.changed({**own, **values})
 
     def _with_gains(self, values: Mapping[str, Any]) -> GoToGoalParameters:
         """Return these with the gains of the controllers that are chosen with new values."""
-        more = {gain.name: gain for gain in self.more_gains}
-        choices: tuple[Controllers[Any], ...] = self.controllers, self.path_controllers
-        for known in choices:
+        more, used = self.more_gains, {*dir(type(self)), *OF_RCLPY}
+        registries: tuple[Controllers[Any], ...] = self.controllers, self.path_controllers
+        for known in registries:
             name = values.get(known.parameter, getattr(self, known.parameter))
-            if name not in known or name in known.built_in:
-                continue
-            for gain in _found(known, name).gains:
-                self._check_gain(gain, more.get(gain.name) or GAINS.get(gain.name), known, name)
-                if GAINS.get(gain.name) != gain:
-                    more[gain.name] = gain
-        gains = tuple(more.values())
-        if gains == self.more_gains:
-            return self
-        new = {gain.name: gain.default for gain in gains if gain.name not in GAINS}
-        return replace(self, more_gains=gains, gain_values={**new, **self.gain_values})
-
-    def _check_gain(
-        self, gain: Gain, known: Gain | None, controllers: Controllers[Any], name: str
-    ) -> None:
-        """Raise ParameterError if a gain cannot be a parameter beside what is `known` by its name."""
-        what = f"parameter '{controllers.parameter}': {name!r} has a gain {gain.name!r}"
-        if known is None and (hasattr(type(self), gain.name) or gain.name in OF_RCLPY):
-            raise ParameterError(f'{what}, a name that go_to_goal uses otherwise: choose another one')
-        if known is not None and not gain.shares_range(known):
-            raise ParameterError(
-                f'{what} with another unit or other bounds than the parameter of that name: choose '
-                'another name'
-            )
+            if name in known and name not in known.built_in:
+                what = f"parameter '{known.parameter}': {name!r}"
+                more = more.of(_found(known, name), what, GAINS, used)
+        return self if more == self.more_gains else replace(self, more_gains=more)
 
     def limits(self, default: float = MAX_SPEED) -> VelocityLimits:
         """Return the limits of the commands, at most the largest plausible twist."""
@@ -259,11 +224,7 @@ class GoToGoalParameters(TwistParameters):
 
     def actuators(self) -> Actuators:
         """Return how the robot follows commands, as far as it is known."""
-        return Actuators(
-            acceleration=self.acceleration_limits(),
-            lag=self.wheel_lag,
-            delay=nanoseconds(self.command_delay),
-        )
+        return self.actuators_with(self.wheel_lag, self.command_delay)
 
     def arrival(self) -> Arrival:
         """Return the arrival criterion."""

@@ -113,11 +113,7 @@ class VirtualRobotParameters(WheelParameters):
 
     def actuators(self) -> Actuators:
         """Return how commands are followed."""
-        return Actuators(
-            acceleration=self.acceleration_limits(),
-            lag=self.wheel_lag,
-            delay=nanoseconds(self.command_delay),
-        )
+        return self.actuators_with(self.wheel_lag, self.command_delay)
 
     def drift(self) -> Drift | None:
         """Return in what the true motion differs from the odometry; None: in nothing."""

@@ -69,4 +69,4 @@ def test_an_odometry_takes_the_way_that_the_page_lists(lockstep):
         for above in calls_during(lambda: lockstep.run_for(0.02))
         if above[0] in functions
     ]
-    assert taken == page
+    assert taken == page, 'the way in doc/design.md is not that of a message'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 import struct
@@ -24,7 +25,9 @@ from diffdrive_jacobian.bags.message_definitions import (
     known_structure,
     message_class,
 )
+from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.control.controller import Controller
+from diffdrive_jacobian.messages import codecs
 from diffdrive_jacobian.messages.codecs import (
     GOALS,
     JOINT_STATE,
@@ -45,7 +48,7 @@ from diffdrive_jacobian.messages.codecs import (
     Wheels,
 )
 from diffdrive_jacobian.messages.conversion import MessageError, from_twist
-from diffdrive_jacobian.messages.topics import TOPICS
+from diffdrive_jacobian.messages.topics import TABLES, TOPICS
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
@@ -146,6 +149,14 @@ def test_every_codec_is_of_a_type_that_bags_are_read_with():
             codec.reader(known_structure(codec.type_name))
             codec.reader(message_class(codec.type_name))
             assert is_known(codec.type_name)
+
+
+def test_every_codec_that_writes_and_every_table_of_a_run_is_tested():
+    known = {id(codec) for codec, _, _ in WRITTEN}
+    every = [one for one in vars(codecs).values() if isinstance(one, codecs.Codec)]
+    assert [one.type_name for one in every if one.written and id(one) not in known] == []
+    of_runs = {field.name for field in dataclasses.fields(Run)}
+    assert {table.series for table in TABLES} - of_runs == set(), 'a table of TOPICS has no field in Run'
 
 
 def test_values_of_parameters_are_those_of_rclpy():
