@@ -49,7 +49,7 @@ def _decoder(channel: Channel) -> Decoder | None:
         # The type is not installed, or has what is not read here.
         with suppress(UnknownTypeError, TypeError):
             if known(name).type_hash == channel.type_hash:
-                return Reader(types(name), (), bounded=False)
+                return Reader(types(name), ())
     return None
 
 

@@ -31,7 +31,7 @@ from diffdrive_jacobian.bags.message_definitions import (
     recorded_definition_differs,
     type_hashes,
 )
-from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError
+from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import Changes, FaultEvent
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import base_name, namespace_of
@@ -246,8 +246,6 @@ def read_run(
                         (received, stamp or received, row)
                         for stamp, row in topic.table.rows(value, names)
                     ]
-            except LongMessageError:
-                tally.refused[connection.topic] += 1
             except DecodingError:
                 tally.undecodable[connection.topic] += 1
             except MessageError:

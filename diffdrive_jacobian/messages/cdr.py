@@ -11,7 +11,6 @@ encodings, such as those of big-endian machines, are left to rclpy.
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable
 from collections.abc import Sequence as Values
@@ -20,7 +19,6 @@ from itertools import pairwise
 from operator import itemgetter
 from typing import Any, NamedTuple
 
-from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.structure import (
     COUNT,
@@ -44,27 +42,12 @@ _MAX_LAYOUTS = 16
 """Layouts that a Reader keeps, one for each size of message."""
 _MAX_VALUES = 256
 """Largest number of values of a layout that is kept."""
-_MAX_ELEMENTS = 64
-"""Most strings or structures in a sequence that are read one by one. For more, rclpy takes less time."""
-_MAX_READ = 200_000
-"""Most values of a message that are unpacked, and strings and structures that are visited one by one.
-More take seconds, and twenty times their size in memory."""
-_MAX_OTHER = 200_000
-"""Longest message in another encapsulation (bytes): rclpy creates an object for each structure in it."""
 _MAX_REMEMBERED = 1024
 """Largest message whose texts are remembered (bytes)."""
 
 
 class DecodingError(MessageError):
     """Bytes that are not a message of the type."""
-
-
-class LongMessageError(DecodingError):
-    """A message has more values than are read."""
-
-
-class _ManyElementsError(DiffdriveError):
-    """A sequence has more than _MAX_ELEMENTS strings or structures."""
 
 
 class Reader:
@@ -82,7 +65,6 @@ class Reader:
         value: Callable[..., Any] = lambda *fields: fields,
         *,
         whole: bool = True,
-        bounded: bool = True,
         deserialize: Callable[[bytes, Any], Any] | None = None,
     ) -> None:
         """Compile a reader.
@@ -95,10 +77,8 @@ class Reader:
             value: Makes a value of the fields, one argument each. What it raises is passed on. By
                 default their tuple.
             whole: Whether what follows the last field must be valid too.
-            bounded: Whether to refuse messages with more than 200,000 values and strings to read.
             deserialize: `rclpy.serialization.deserialize_message`, for other encapsulations than that
-                of little-endian CDR, which are refused otherwise, and for sequences of many strings. It
-                needs the class.
+                of little-endian CDR, which are refused otherwise. It needs the class.
 
         Raises:
             ValueError: A field does not exist, or cannot be read on its own.
@@ -112,7 +92,6 @@ class Reader:
             check_readable(self._type, field)
         self._value = value
         self._whole = whole
-        self._budget = _MAX_READ if bounded else math.inf
         self._deserialize = deserialize
         self._layouts: dict[int, _Layout] = {}
 
@@ -126,7 +105,6 @@ class Reader:
 
         Raises:
             DecodingError: The bytes are not a message of this type.
-            LongMessageError: They are, as far as they were read, but have too many values.
         """
         layout = self._layouts.get(len(data))
         if layout is not None:
@@ -139,13 +117,10 @@ class Reader:
         """Read a message whose layout is not known."""
         if len(data) >= ENCAPSULATION and data[:2] != LITTLE_ENDIAN:
             return self._read_message(data)
-        most = math.inf if self._deserialize is None else _MAX_ELEMENTS
         try:
-            layout = _Walk(data, self._fields, self._whole, most, self._budget).layout(self._type)
+            layout = _Walk(data, self._fields, self._whole).layout(self._type)
         except struct.error as error:
             raise self._undecodable() from error
-        except _ManyElementsError:
-            return self._read_message(data)
         values = layout.unpack_from(data)
         if len(values) <= _MAX_VALUES:
             if len(self._layouts) >= _MAX_LAYOUTS:
@@ -159,11 +134,6 @@ class Reader:
             raise DecodingError(
                 f'a {self._type.short_name} message must be little-endian CDR, which begins with 0001, '
                 f'if rclpy does not read it; it begins with {data[:2].hex()}'
-            )
-        if data[:2] != LITTLE_ENDIAN and len(data) > _MAX_OTHER:
-            raise DecodingError(
-                f'a {self._type.short_name} message must have at most {_MAX_OTHER} bytes, unless it is '
-                f'little-endian CDR, got {len(data)}'
             )
         try:
             message = self._deserialize(data, self._class)
@@ -213,12 +183,8 @@ class _Format:
 class _Walk:
     """One pass over a message, which collects its layout. Raises struct.error where the bytes end."""
 
-    def __init__(
-        self, data: bytes, fields: tuple[str, ...], whole: bool, most: float, budget: float
-    ) -> None:
+    def __init__(self, data: bytes, fields: tuple[str, ...], whole: bool) -> None:
         self._data = data
-        self._most = most
-        self._budget = budget
         self._fields = fields
         self._missing = set(fields)
         self._whole = whole
@@ -314,9 +280,6 @@ class _Walk:
             # Such as points, which are doubles without padding.
             self._advance(count * least_size(kind), unit if count else 1)
             return
-        if count > self._most:
-            raise _ManyElementsError
-        self._spend(count)
         if isinstance(kind, Text):
             first, wanted = self._format.values, path in self._missing
             for _ in range(count):
@@ -331,7 +294,6 @@ class _Walk:
     def _numbers(self, kind: Number, count: int, path: str, *, many: bool = False) -> None:
         start = self._advance(count * kind.size, kind.size if count else 1)
         if path in self._missing:
-            self._spend(count)
             first = self._format.add(start, f'{count}{kind.code}', count * kind.size, count)
             self._found(path, slice(first, first + count) if many else first)
 
@@ -355,11 +317,6 @@ class _Walk:
         if self._offset > len(self._data):
             raise struct.error('the bytes end within the message')
         return start
-
-    def _spend(self, count: int) -> None:
-        self._budget -= count
-        if self._budget < 0:
-            raise LongMessageError('it has more values than are read of one message')
 
 
 def _converted(raw: Any) -> Any:

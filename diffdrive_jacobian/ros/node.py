@@ -157,13 +157,15 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         Raises:
             ParameterError: As for `advertise`.
         """
+        # That of rclpy is one for all topics.
+        throttle = TokenBucket(1, THROTTLE)
 
         def dropped(error: MessageError) -> None:
             if refused is not None and not isinstance(error, DecodingError):
                 refused(error)
-                return
-            what = topic if isinstance(error, DecodingError) else called or topic
-            self.get_logger().warning(f'{what} dropped: {error}', throttle_duration_sec=THROTTLE)
+            elif throttle.permits(time.monotonic()):
+                what = topic if isinstance(error, DecodingError) else called or topic
+                self.get_logger().warning(f'{what} dropped: {error}')
 
         self.watch(wrong_type(self, topic, message, subscribed=True), TYPE_PATIENCE, error=True)
         if numbers is not None:

@@ -15,9 +15,9 @@ from diffdrive_jacobian.ros.rclpy_internals import request_message_info
 
 V = TypeVar('V')
 
-MAX_SIZE = 1 << 20
-"""Size of the largest message that clients of our nodes decode (bytes). rclpy would take minutes for a
-Goals message of 1.5 million poses."""
+MAX_SIZE = 1 << 21
+"""Size of the largest message that is read (bytes). A path of the greatest length has half of it. One of
+that size takes at most a second."""
 
 
 def receiver(
@@ -33,8 +33,8 @@ def receiver(
         codec: What is read of them.
         message_type: Their type.
         callback: Takes the value of each. It refuses one by a MessageError.
-        refused: Called instead if the bytes are no message of the type (`DecodingError`) or the value is
-            invalid, and if the callback refuses it.
+        refused: Called instead if the bytes are no message of the type or too many (`DecodingError`), if
+            the value is invalid, and if the callback refuses it.
         numbers: Receives the sequence number of each message.
     """
     read = codec.reader(message_type, deserialize_message)
@@ -46,6 +46,8 @@ def receiver(
             # None where the middleware does not number messages.
             numbers.number = info.get('publication_sequence_number')
         try:
+            if len(data) > MAX_SIZE:
+                raise DecodingError(f'it must have at most {MAX_SIZE} bytes, got {len(data)}')
             callback(read(data))
         except MessageError as error:
             refused(error)
@@ -63,22 +65,10 @@ def ignoring_invalid(
     callback: Callable[[V], object],
     refused: Callable[[MessageError], object] = lambda _: None,
 ) -> Callable[[bytes], None]:
-    """Return a callback as `receiver` does, for clients.
-
-    It ignores what is no message of the type, and messages beyond `MAX_SIZE`: for each that it cannot
-    decode, the middleware would write several lines to standard error.
-    """
+    """Return a callback as `receiver` does, for clients: they ignore what cannot be decoded."""
 
     def report(error: MessageError) -> None:
         if not isinstance(error, DecodingError):
             refused(error)
 
-    receive = receiver(codec, message_type, callback, report)
-
-    def receive_short(data: bytes) -> None:
-        if len(data) <= MAX_SIZE:
-            receive(data)
-
-    # Reports name a callback.
-    receive_short.__qualname__ = receive.__qualname__
-    return receive_short
+    return receiver(codec, message_type, callback, report)

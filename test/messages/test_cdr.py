@@ -27,7 +27,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan
 from std_msgs.msg import Empty, Float64MultiArray, Header, String
 
-from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError, Reader, Writer
+from diffdrive_jacobian.messages.cdr import DecodingError, Reader, Writer
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import import_type
 from diffdrive_jacobian.messages.structure import (
@@ -253,19 +253,10 @@ def test_other_encapsulations_are_left_to_rclpy():
                 Reader(Header, fields)(data)
 
 
-@pytest.mark.parametrize(('count', 'converted'), [(64, 0), (65, 1), (3000, 1)])
-def test_sequences_of_many_strings_are_left_to_rclpy_which_is_faster(count, converted):
-    calls = []
-
-    def deserialize(data, kind):
-        calls.append(kind)
-        return deserialize_message(data, kind)
-
-    names, fields = [str(one) for one in range(count)], ['name', 'velocity']
-    data = serialize_message(JointState(name=names, velocity=[0.5] * count))
-    for read in (Reader(JointState, fields, deserialize=deserialize), Reader(JointState, fields)):
-        assert read(data) == (tuple(names), (0.5,) * count)
-    assert len(calls) == converted
+def test_sequences_of_many_strings_are_read_as_others():
+    names = [str(one) for one in range(3000)]
+    data = serialize_message(JointState(name=names, velocity=[0.5] * 3000))
+    assert Reader(JointState, ['name', 'velocity'])(data) == (tuple(names), (0.5,) * 3000)
 
 
 def test_a_huge_length_takes_no_memory():
@@ -279,19 +270,6 @@ def test_a_huge_length_takes_no_memory():
         assert tracemalloc.get_traced_memory()[1] < 100_000
     finally:
         tracemalloc.stop()
-
-
-def test_a_message_with_very_many_values_is_refused_unless_it_is_only_checked():
-    assert Reader(JointState, ['velocity'])(serialize_message(JointState(velocity=[0.5] * 100_000)))
-    numbers = serialize_message(JointState(velocity=[0.5] * 200_001))
-    count = 200_001
-    texts = b'\0\1\0\0' + bytes(12) + struct.pack('<I', count) + b'\1\0\0\0\0\0\0\0' * count + bytes(12)
-    for data, fields in ((numbers, ['velocity']), (texts, []), (texts, ['name'])):
-        with pytest.raises(LongMessageError, match='more values than are read'):
-            Reader(JointState, fields)(data)
-    assert Reader(JointState, [], bounded=False)(texts) == ()
-    # Numbers that are not asked for take nothing.
-    assert Reader(JointState, ['name'])(numbers) == ((),)
 
 
 def test_messages_of_many_sizes_are_read_one_after_the_other_in_little_memory():

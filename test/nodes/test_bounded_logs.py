@@ -163,7 +163,10 @@ def test_bytes_that_are_no_goals_or_too_many_to_convert_are_dropped(lockstep, co
     assert controller.statuses == [(2, ABORTED)]
     publisher.publish(big_endian_goals(MAX_WAYPOINTS + 1000))
     lockstep.settle()
-    assert 'goals dropped: a Goals message must have at most 200000 bytes' in capfd.readouterr().err
+    assert f'goals must contain at most {MAX_WAYPOINTS} poses' in capfd.readouterr().err
+    publisher.publish(big_endian_goals(30_000))
+    lockstep.settle()
+    assert 'goals dropped: it must have at most 2097152 bytes, got 21600' in capfd.readouterr().err
     for data in (
         b'',
         b'\0\1\0\0',
@@ -174,7 +177,7 @@ def test_bytes_that_are_no_goals_or_too_many_to_convert_are_dropped(lockstep, co
         publisher.publish(data)
         lockstep.settle()
     # One of them has a header.
-    assert set(controller.statuses[1:]) <= {(0, ABORTED)}
+    assert set(controller.statuses[2:]) <= {(0, ABORTED)}
     controller.send(goal(1, 0, stamp=3))
     assert controller.at(0, 0) == (0.5, 0.0)
     assert controller.statuses[-1] == (3, EXECUTING)
