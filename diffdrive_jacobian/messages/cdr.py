@@ -72,8 +72,8 @@ class Reader:
         Args:
             kind: Type of the messages: their class or its `Structure`.
             fields: Paths such as `header.stamp.sec`. A path to a number gives a number, to a string a
-                str, to an array or sequence of them a tuple. `len(goals)` gives the length of a
-                sequence, `goals[].pose.position.x` a tuple with that field of each of its elements.
+                str, to an array or sequence of them a tuple. `goals[].pose.position.x` gives a tuple
+                with that field of each element of a sequence.
             value: Makes a value of the fields, one argument each. What it raises is passed on. By
                 default their tuple.
             whole: Whether what follows the last field must be valid too.
@@ -251,7 +251,6 @@ class _Walk:
                 self._elements(kind.element, kind.count, path)
             case Sequence():
                 count = self._length()
-                self._found(f'len({path})', self._lengths[-1])
                 if not self._done:
                     self._elements(kind.element, count, path)
 

@@ -65,22 +65,6 @@ class GoalError(MessageError):
         self.stamp = stamp
 
 
-class Limit(NamedTuple):
-    """How many poses goals may have. They are counted before they are read, which may take long."""
-
-    topic: str
-    sequence: str
-    """Field with the poses."""
-    most: int
-
-    def check(self, sec: int, nanosec: int, count: int) -> None:
-        """Raise GoalError if there are more; `sec` and `nanosec` are the stamp of the message."""
-        if count > self.most:
-            raise GoalError(
-                f'{self.topic} must contain at most {self.most} poses, got {count}', (sec, nanosec)
-            )
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class Codec(Generic[V]):
     """How one type of message becomes a value, and back."""
@@ -95,8 +79,6 @@ class Codec(Generic[V]):
     """Paths of the numbers that are written, as `cdr.Writer` takes them."""
     numbers: Callable[[V], tuple[Any, ...]] = lambda _: ()
     """Returns these numbers of a value."""
-    limit: Limit | None = None
-    """How long the messages may be."""
 
     def reader(
         self, kind: Any, deserialize: Callable[[bytes, Any], Any] | None = None
@@ -106,18 +88,7 @@ class Codec(Generic[V]):
         It raises MessageError: DecodingError if the bytes are not a message of the type, and others if
         the value is invalid.
         """
-        read = Reader(kind, self.fields, self.value, deserialize=deserialize)
-        if (limit := self.limit) is None:
-            return read
-        fields = (*STAMP, f'len({limit.sequence})')
-        check = Reader(kind, fields, limit.check, whole=False, deserialize=deserialize)
-
-        def checked(data: bytes) -> V:
-            check(data)
-            value: V = read(data)
-            return value
-
-        return checked
+        return Reader(kind, self.fields, self.value, deserialize=deserialize)
 
     def writer(self, template: Any) -> Writer:
         """Return what serializes values, with the strings and the lengths of a template."""
@@ -332,23 +303,27 @@ def _pose(sec: int, nanosec: int, frame: str, *pose: float) -> Route:
 
 
 def _goals(sec: int, nanosec: int, frame: str, frames: Texts, *columns: Column) -> Route:
-    stamp, poses = (sec, nanosec), [*zip(*columns, strict=True)]
-    if not poses:
-        raise GoalError(f'goals must contain at least one pose, got none ({TO_STOP})', stamp)
-    return _route(stamp, frame, frames, poses)
+    count = len(frames)
+    if not 1 <= count <= MAX_WAYPOINTS:
+        raise GoalError(
+            f'goals must contain 1 to {MAX_WAYPOINTS} poses, got {count} ({TO_STOP})',
+            (sec, nanosec),
+        )
+    return _route((sec, nanosec), frame, frames, zip(*columns, strict=True))
 
 
 def _path(
     sec: int, nanosec: int, frame: str, frames: Texts, secs: Column, nanosecs: Column, *columns: Column
 ) -> Route:
-    stamp, poses = (sec, nanosec), [*zip(*columns, strict=True)]
-    if len(poses) < 2:
+    count = len(frames)
+    if not 2 <= count <= MAX_PATH_POSES:
         raise GoalError(
-            f'path must contain at least two poses, got {len(poses)} ({TO_STOP}; to drive to one pose, '
-            'publish goal_pose)',
-            stamp,
+            f'path must contain 2 to {MAX_PATH_POSES} poses, got {count} ({TO_STOP}; to drive to one '
+            'pose, publish goal_pose)',
+            (sec, nanosec),
         )
-    return _route(stamp, frame, frames, poses, zip(secs, nanosecs, strict=True))
+    stamps = zip(secs, nanosecs, strict=True)
+    return _route((sec, nanosec), frame, frames, zip(*columns, strict=True), stamps)
 
 
 def _route(
@@ -400,7 +375,6 @@ GOALS = Codec(
     'nav_msgs/msg/Goals',
     (*STAMP, FRAME, 'goals[].header.frame_id', *(f'goals[].pose.{field}' for field in _POSE)),
     _goals,
-    limit=Limit('goals', 'goals', MAX_WAYPOINTS),
 )
 PATH = Codec(
     'nav_msgs/msg/Path',
@@ -410,7 +384,6 @@ PATH = Codec(
         *(f'poses[].pose.{field}' for field in _POSE),
     ),
     _path,
-    limit=Limit('path', 'poses', MAX_PATH_POSES),
 )
 GOAL_STATUS = Codec(
     'action_msgs/msg/GoalStatus',

@@ -218,7 +218,6 @@ def least_size(kind: FieldType) -> int:
             return max(1, sum(least_size(one) for _, one in kind.fields))
 
 
-LENGTH = re.compile(r'len\(([\w.]+)\)')
 _STEP = re.compile(r'([A-Za-z]\w*)(?:\[(\d+)\])?')
 
 
@@ -335,9 +334,6 @@ class MessageField:
 
 def field_value(message: Any, field: str) -> Any:
     """Return a field of a message object, as `cdr.Reader` returns it."""
-    length = LENGTH.fullmatch(field)
-    if length:
-        return len(_value(message, length[1]))
     before, sequence, after = field.partition('[].')
     if sequence:
         return tuple(plain(_value(one, after)) for one in _value(message, before))
@@ -352,11 +348,9 @@ def _value(message: Any, path: str) -> Any:
 
 def check_readable(kind: Structure, field: str) -> None:
     """Raise ValueError unless `cdr.Reader` can return this field."""
-    length = LENGTH.fullmatch(field)
     found: FieldType = kind
-    steps = (length[1] if length else field).split('.')
     of_each = True
-    for step in steps:
+    for step in field.split('.'):
         name = step.removesuffix('[]')
         inner = dict(found.fields) if isinstance(found, Structure) else {}
         if name not in inner:
@@ -368,14 +362,9 @@ def check_readable(kind: Structure, field: str) -> None:
         if step != name and isinstance(found, Sequence):
             of_each = isinstance(found.element, Structure)
             found = found.element
-    if length:
-        readable = isinstance(found, Sequence)
-    else:
-        simple = found.element if isinstance(found, (Array, Sequence)) else found
-        readable = of_each and isinstance(simple, (Number, Text)) and field.count('[]') <= 1
-    if not readable:
+    simple = found.element if isinstance(found, (Array, Sequence)) else found
+    if not (of_each and isinstance(simple, (Number, Text)) and field.count('[]') <= 1):
         raise ValueError(
             f'a field of {kind.short_name} must be a number, a string, an array or sequence of them, '
-            f"such a field of each element of one sequence ('goals[].pose.position.x'), or len() of a "
-            f"sequence, got '{field}'"
+            f"or such a field of each element of one sequence ('goals[].pose.position.x'), got '{field}'"
         )

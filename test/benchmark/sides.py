@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
+from diffdrive_jacobian.messages.codecs import Route, State
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
@@ -116,16 +117,16 @@ class CountedController(GoToGoal):
 
     received = 0
 
-    def _on_odometry(self, *fields: Any) -> None:
+    def _on_odometry(self, state: State) -> None:
         self.received += 1
-        super()._on_odometry(*fields)
+        super()._on_odometry(state)
 
 
 def our_controller(**kwargs: Any) -> CountedController:
     """Make our controller with a goal that it never reaches."""
     slow = Parameter('linear.x.max_velocity', value=SPEED)
     controller = CountedController(parameter_overrides=[slow], **kwargs)
-    controller._on_goal_pose(0, 0, '', FAR, FAR, 0.0, 0.0, 0.0, 1.0)
+    controller._on_pose(Route((0, 0), '', ((FAR, FAR, 0.0),)))
     return controller
 
 

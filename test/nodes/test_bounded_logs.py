@@ -142,7 +142,7 @@ def test_goals_with_too_many_poses_are_refused(controller, capfd):
     controller.at(0, 0)
     message = goals(*[goal(1, 0)] * (MAX_WAYPOINTS + 1), stamp=2)
     controller.send(message)
-    words = f'goals must contain at most {MAX_WAYPOINTS} poses, got {MAX_WAYPOINTS + 1}'
+    words = f'goals must contain 1 to {MAX_WAYPOINTS} poses, got {MAX_WAYPOINTS + 1}'
     assert words in capfd.readouterr().err
     assert controller.statuses[-2:] == [(2, ABORTED), (1, EXECUTING)]
     message.goals.pop()
@@ -163,7 +163,7 @@ def test_bytes_that_are_no_goals_or_too_many_to_convert_are_dropped(lockstep, co
     assert controller.statuses == [(2, ABORTED)]
     publisher.publish(big_endian_goals(MAX_WAYPOINTS + 1000))
     lockstep.settle()
-    assert f'goals must contain at most {MAX_WAYPOINTS} poses' in capfd.readouterr().err
+    assert f'goals must contain 1 to {MAX_WAYPOINTS} poses' in capfd.readouterr().err
     publisher.publish(big_endian_goals(30_000))
     lockstep.settle()
     assert 'goals dropped: it must have at most 2097152 bytes, got 21600' in capfd.readouterr().err
