@@ -14,8 +14,9 @@ import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
 from diffdrive_jacobian.faults.fault import Filter, TopicFault
+from diffdrive_jacobian.faults.message_field import MessageField
 from diffdrive_jacobian.messages import conversion
-from diffdrive_jacobian.messages.structure import FieldType, MessageField, Number, Text, is_stamp
+from diffdrive_jacobian.messages.structure import FieldType, Number, Text, is_stamp
 from diffdrive_jacobian.numerics.checks import Count, Name, NotNegative, Positive, Probability, one_of
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 

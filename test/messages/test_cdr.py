@@ -27,12 +27,12 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan
 from std_msgs.msg import Empty, Float64MultiArray, Header, String
 
+from diffdrive_jacobian.faults.message_field import MessageField
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader, Writer
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import import_type
 from diffdrive_jacobian.messages.structure import (
     Array,
-    MessageField,
     Number,
     Sequence,
     Structure,
