@@ -294,7 +294,7 @@ def drive(
                 # The goals were received only now.
                 controller.stop(reason)
             state = client.robot
-            return state is not None and state.stamp >= settled and not state.moving
+            return state is not None and client.stamp >= settled and state.twist == (0.0, 0.0)
 
         patience = STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
         runner.spin(stands, timeout=patience, signals=signals, handled=signals.count)
@@ -307,8 +307,8 @@ def drive(
         return Outcome(
             status=status,
             interrupted=signals.count > 0,
-            pose=None if client.robot is None else client.robot.pose,
-            moving=client.robot is not None and client.robot.fastest > STANDING,
+            pose=None if client.robot is None else np.array(client.robot.pose),
+            moving=client.robot is not None and max(map(abs, client.robot.twist)) > STANDING,
             distance=client.distance,
             true_distance=true_distance,
             across=math.nan if client.path is None else client.path.greatest,

@@ -161,8 +161,10 @@ class Motion(NamedTuple):
 
 
 class State(NamedTuple):
-    """Pose and twist now."""
+    """Pose and twist of a robot, as those who drive it need them."""
 
+    stamp: tuple[int, int]
+    """`sec` and `nanosec`; not checked."""
     frame: str
     """Frame of the pose."""
     pose: tuple[float, float, float]
@@ -245,12 +247,14 @@ MOTION = Codec(
 ODOMETRY_STATE = Codec(
     'nav_msgs/msg/Odometry',
     (
-        *(FRAME, 'twist.twist.linear.x', 'twist.twist.angular.z'),
+        *(FRAME, *STAMP, 'twist.twist.linear.x', 'twist.twist.angular.z'),
         *pose_fields('nav_msgs/msg/Odometry'),
     ),
-    lambda frame, v, omega, *pose: State(frame, from_pose(*pose), (v, omega)),
+    lambda frame, sec, nanosec, v, omega, *pose: State(
+        (sec, nanosec), frame, from_pose(*pose), (v, omega)
+    ),
 )
-"""Odometry as the controller needs it."""
+"""Odometry as those who drive need it."""
 POSE_WITH_COVARIANCE = Codec(
     'geometry_msgs/msg/PoseWithCovarianceStamped',
     (

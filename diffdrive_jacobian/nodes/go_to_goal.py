@@ -100,7 +100,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         super().__init__('go_to_goal', defaults, **kwargs)
         self._goal: ActiveGoal | None = None
         self._goals_received = 0
-        self._state = State('', (0.0, 0.0, 0.0), STANDSTILL)
+        self._state = State((0, 0), '', (0.0, 0.0, 0.0), STANDSTILL)
         self._rate = OdometryRate()
         # Whether the last command makes the robot move: it outlives a goal that is replaced.
         self._driving = False

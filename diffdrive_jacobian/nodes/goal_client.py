@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from action_msgs.msg import GoalStatus
@@ -23,15 +23,8 @@ from diffdrive_jacobian.control import Arrival, Path
 from diffdrive_jacobian.control.path import PathProgress
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages.codecs import (
-    GOAL_STATUS,
-    ODOMETRY,
-    STAMP,
-    Codec,
-    Status,
-    pose_fields,
-)
-from diffdrive_jacobian.messages.conversion import MessageError, from_pose, from_time
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, ODOMETRY_STATE, State, Status
+from diffdrive_jacobian.messages.conversion import MessageError, from_time
 from diffdrive_jacobian.messages.goal_status import GoalFollower, GoalState
 from diffdrive_jacobian.messages.names import is_named, node_of
 from diffdrive_jacobian.ros.node import THROTTLE
@@ -43,39 +36,6 @@ DRIVEN_POINT_PARAMETERS = ('controller', 'offset')
 """Parameters of a controller that determine which point of the robot it drives."""
 MESSAGES: dict[str, type] = {'goal_pose': PoseStamped, 'goals': Goals, 'path': PathMessage}
 """Topic of goals to its type."""
-
-
-class RobotOdometry(NamedTuple):
-    """What an odometry message says about the robot."""
-
-    pose: NDArray[np.float64]
-    """`[x, y, theta]`, shape (3,) (m, m, rad)."""
-    moving: bool
-    """Whether its twist is not zero."""
-    stamp: int
-    """Timestamp of the message (ns)."""
-    fastest: float
-    """The larger of speed and yaw rate (m/s, rad/s)."""
-
-
-def _state(sec: int, nanosec: int, v: float, omega: float, *pose: float) -> RobotOdometry:
-    return RobotOdometry(
-        pose=np.array(from_pose(*pose)),
-        moving=(v, omega) != (0.0, 0.0),
-        stamp=from_time(sec, nanosec),
-        fastest=max(abs(v), abs(omega)),
-    )
-
-
-STATE = Codec(
-    ODOMETRY.type_name,
-    (
-        *(*STAMP, 'twist.twist.linear.x', 'twist.twist.angular.z'),
-        *pose_fields(ODOMETRY.type_name),
-    ),
-    _state,
-)
-"""What a client reads of odometry. The twist only tells whether the robot moves: it may be anything."""
 
 
 def goals_message(
@@ -161,8 +121,10 @@ class GoalClient(Node):  # type: ignore[misc]
         self._begun = self._latest = 0
         self.arrival = Arrival()
         """Determines which point of the robot is to arrive. The default is the axle centre."""
-        self.robot: RobotOdometry | None = None
-        """State in the last odometry. None: no odometry was received."""
+        self.robot: State | None = None
+        """The robot by the last odometry. None: no odometry was received."""
+        self.stamp = 0
+        """Stamp of the last odometry (ns)."""
         self._monotonic = monotonic
         self.seen = monotonic()
         """Time of the last odometry, or since when it is expected (s, monotonic)."""
@@ -180,7 +142,9 @@ class GoalClient(Node):  # type: ignore[misc]
             received = ignoring_invalid(GOAL_STATUS, GoalStatus, self._on_status)
             self.create_subscription(GoalStatus, 'goal_status', received, latched, raw=True)
         with explaining_failure(self, Odometry, 'odom'):
-            moved = ignoring_invalid(STATE, Odometry, self._on_odometry, self._on_invalid_odometry)
+            moved = ignoring_invalid(
+                ODOMETRY_STATE, Odometry, self._on_odometry, self._on_invalid_odometry
+            )
             self.create_subscription(Odometry, 'odom', moved, 10, raw=True)
         # rclpy reports a name that is too long only here.
         self.resolve_service_name('cancel_goal')
@@ -328,14 +292,15 @@ class GoalClient(Node):  # type: ignore[misc]
         # Other processes may publish, and anything.
         self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
 
-    def _on_odometry(self, state: RobotOdometry) -> None:
+    def _on_odometry(self, state: State) -> None:
+        self.stamp = from_time(*state.stamp)
         self.robot = state
         self.seen = self._monotonic()
         if self._send_on_odometry:
             self.send()
         if self.path is not None and self.status is GoalState.EXECUTING:
-            self.path.moved(state.pose)
-            self._begun, self._latest = self._begun or state.stamp, state.stamp
+            self.path.moved(np.array(state.pose))
+            self._begun, self._latest = self._begun or self.stamp, self.stamp
 
 
 def driven_offset(values: Mapping[str, Any]) -> float:

@@ -44,6 +44,7 @@ MIN_DISTANCE = 0.005
 """Smallest displacement that is motion (m): more than the noise of odometry at rest."""
 MIN_ROTATION = 0.01
 """Smallest rotation that is motion (rad)."""
+Pose = tuple[float, float, float]
 HEADING_PARAMETERS = (*DRIVEN_POINT_PARAMETERS, 'use_goal_heading')
 """Parameters of a controller that also determine whether it takes the heading of a goal."""
 
@@ -458,7 +459,7 @@ class Standstill:
 
     def __init__(self) -> None:
         """Start without a pose."""
-        self._reference: NDArray[np.float64] | None = None
+        self._reference: Pose | None = None
         self._since = 0.0
         self._detected = False
 
@@ -466,9 +467,9 @@ class Standstill:
         """Forget the poses: the robot is not expected to move."""
         self._reference = None
 
-    def update(self, pose: NDArray[np.float64], now: float) -> bool:
+    def update(self, pose: Pose, now: float) -> bool:
         """Return whether a robot with a pose at a time (s) stands still, once for each standstill."""
-        if self._reference is None or _moved(pose - self._reference):
+        if self._reference is None or _moved(self._reference, pose):
             self._reference, self._since, self._detected = pose, now, False
             return False
         if self._detected or now - self._since < STANDSTILL_PATIENCE:
@@ -477,6 +478,6 @@ class Standstill:
         return True
 
 
-def _moved(difference: NDArray[np.float64]) -> bool:
-    x, y, theta = (float(value) for value in difference)
-    return math.hypot(x, y) > MIN_DISTANCE or abs(math.remainder(theta, math.tau)) > MIN_ROTATION
+def _moved(before: Pose, after: Pose) -> bool:
+    turn = math.remainder(after[2] - before[2], math.tau)
+    return math.dist(before[:2], after[:2]) > MIN_DISTANCE or abs(turn) > MIN_ROTATION

@@ -195,7 +195,7 @@ class Steering:
 
         What a law raises, a ValueError, is passed on.
         """
-        _, pose, twist = state
+        pose, twist = state.pose, state.twist
         # For laws that remember something.
         self._law.now = self._path_law.now = now
         command = None

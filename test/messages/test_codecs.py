@@ -91,7 +91,8 @@ def test_a_command_of_a_big_endian_machine_is_followed(lockstep):
 
 def test_the_controller_reads_frame_and_pose_of_an_odometry():
     for message in (Odometry(), odometry(1.0, -2.0, 0.5, frame='Karte ä')):
-        frame, pose, twist = ODOMETRY_STATE.reader(Odometry)(serialize_message(message))
+        stamp, frame, pose, twist = ODOMETRY_STATE.reader(Odometry)(serialize_message(message))
+        assert stamp == (message.header.stamp.sec, message.header.stamp.nanosec)
         assert frame == message.header.frame_id
         assert twist == value_of(ODOMETRY, message).twist
         assert pose == value_of(ODOMETRY, message).pose == tuple(pose_of(message))

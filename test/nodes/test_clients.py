@@ -271,19 +271,20 @@ def test_a_goal_without_an_answer_is_withdrawn():
 
 def test_each_standstill_is_detected_once():
     found = Standstill()
-    rest, later = np.array([1.0, 2.0, 3.14]), np.array([1.1, 2.0, 3.14])
+    rest, later = (1.0, 2.0, 3.14), (1.1, 2.0, 3.14)
     assert [found.update(rest, now) for now in (0.0, 4.9, 5.0, 6.0, 20.0)] == [0, 0, 1, 0, 0]
     # Noise and a turn of the angle are no motion.
     found.update(later, 21.0)
-    noisy = later + np.array([0.002, -0.002, 0.001 - math.tau])
+    noisy = (1.102, 1.998, 3.141 - math.tau)
     assert [found.update(noisy, now) for now in (25.9, 26.0, 27.0)] == [0, 1, 0]
     # A robot without a goal may stand still.
     found.reset()
-    assert [found.update(np.zeros(3), now) for now in (30.0, 34.9, 35.0)] == [0, 0, 1]
+    assert [found.update((0.0, 0.0, 0.0), now) for now in (30.0, 34.9, 35.0)] == [0, 0, 1]
     # Slow motion is none.
     for step in ([0.006, 0.0, 0.0], [0.0, -0.006, 0.0], [0.0, 0.0, 0.011]):
         found = Standstill()
-        assert not any(found.update(np.array(step) * now / 4.0, now) for now in range(0, 60, 2))
+        slow = [(tuple(one * now / 4.0 for one in step), now) for now in range(0, 60, 2)]
+        assert not any(found.update(*one) for one in slow)
 
 
 def test_a_goal_of_a_robot_that_does_not_move_is_reported():

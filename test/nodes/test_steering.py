@@ -28,7 +28,7 @@ def path(*places, times=None, frame=''):
 
 
 def at(x, y, theta=0.0, twist=(0.0, 0.0)):
-    return State('odom', (float(x), float(y), theta), twist)
+    return State((0, 0), 'odom', (float(x), float(y), theta), twist)
 
 
 def steering(before=None, **parameters):
