@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from diffdrive_jacobian.messages.cdr import Reader, Writer
@@ -122,19 +122,32 @@ class Command(NamedTuple):
     """From when on (ns); 0: from when it is received."""
 
 
+def _command(*twist: float) -> Command:
+    return Command(from_twist(*twist))
+
+
+def _stamped_command(sec: int, nanosec: int, *twist: float) -> Command:
+    return Command(from_twist(*twist), from_time(sec, nanosec))
+
+
+def _stamped_numbers(command: Command) -> tuple[float, ...]:
+    twist, stamp = command
+    return (*divmod(stamp, NANOSECONDS), *twist)
+
+
 TWIST = Codec(
     'geometry_msgs/msg/Twist',
     twist_fields('geometry_msgs/msg/Twist'),
-    lambda *twist: Command(from_twist(*twist)),
+    _command,
     ('linear.x', 'angular.z'),
-    itemgetter(0),
+    attrgetter('twist'),
 )
 TWIST_STAMPED = Codec(
     'geometry_msgs/msg/TwistStamped',
     (*STAMP, *twist_fields('geometry_msgs/msg/TwistStamped')),
-    lambda sec, nanosec, *twist: Command(from_twist(*twist), from_time(sec, nanosec)),
+    _stamped_command,
     (*STAMP, 'twist.linear.x', 'twist.angular.z'),
-    lambda command: (*divmod(command[1], NANOSECONDS), *command[0]),
+    _stamped_numbers,
 )
 
 # --- Poses: odom, ground_truth, start_pose, initialpose
@@ -170,7 +183,7 @@ class State(NamedTuple):
     pose: tuple[float, float, float]
     """`(x, y, theta)` (m, m, rad)."""
     twist: tuple[float, float]
-    """`(v, omega)` in the body frame (m/s, rad/s); not checked."""
+    """`(v, omega)` in the body frame (m/s, rad/s), finite."""
 
 
 class Place(NamedTuple):
@@ -188,14 +201,13 @@ class Place(NamedTuple):
 
 def _motion(sec: int, nanosec: int, frame: str, *values: Any) -> Motion:
     *numbers, of_pose, of_twist = values
-    return Motion(
-        from_time(sec, nanosec),
-        from_pose(*numbers[:6]),
-        from_twist(*numbers[6:]),
-        _planar(of_pose),
-        _forward_and_yaw(of_twist),
-        frame,
-    )
+    motion = _motion_alone(sec, nanosec, frame, *numbers)
+    return motion._replace(covariance=_planar(of_pose), twist_covariance=_forward_and_yaw(of_twist))
+
+
+def _motion_alone(sec: int, nanosec: int, frame: str, *values: float) -> Motion:
+    pose, twist = values[:6], values[6:]
+    return Motion(from_time(sec, nanosec), from_pose(*pose), from_twist(*twist), frame=frame)
 
 
 def _motion_numbers(motion: Motion) -> tuple[float, ...]:
@@ -208,6 +220,12 @@ def _place_numbers(place: Place) -> tuple[float, ...]:
     stamp, (x, y, theta), covariance, _ = place
     orientation = math.sin(theta / 2.0), math.cos(theta / 2.0)
     return (*divmod(stamp, NANOSECONDS), x, y, *orientation, *covariance)
+
+
+def _state(frame: str, sec: int, nanosec: int, v: float, omega: float, *pose: float) -> State:
+    if not math.isfinite(v + omega):
+        raise MessageError(f'twist must be finite, got v {v:g}, omega {omega:g}')
+    return State((sec, nanosec), frame, from_pose(*pose), (v, omega))
 
 
 def _place(sec: int, nanosec: int, frame: str, *values: Any) -> Place:
@@ -239,9 +257,7 @@ ODOMETRY = Codec(
 MOTION = Codec(
     'nav_msgs/msg/Odometry',
     ODOMETRY.fields[:-2],
-    lambda sec, nanosec, frame, *values: Motion(
-        from_time(sec, nanosec), from_pose(*values[:6]), from_twist(*values[6:]), frame=frame
-    ),
+    _motion_alone,
 )
 """Odometry without its covariances."""
 ODOMETRY_STATE = Codec(
@@ -250,9 +266,7 @@ ODOMETRY_STATE = Codec(
         *(FRAME, *STAMP, 'twist.twist.linear.x', 'twist.twist.angular.z'),
         *pose_fields('nav_msgs/msg/Odometry'),
     ),
-    lambda frame, sec, nanosec, v, omega, *pose: State(
-        (sec, nanosec), frame, from_pose(*pose), (v, omega)
-    ),
+    _state,
 )
 """Odometry as those who drive need it."""
 POSE_WITH_COVARIANCE = Codec(
@@ -465,7 +479,7 @@ WHEEL_ARRAY = Codec(
     ('data',),
     WheelArray,
     ('data',),
-    itemgetter(0),
+    attrgetter('velocities'),
 )
 
 # --- Events: parameter_events, fault_events

@@ -17,8 +17,8 @@ from diffdrive_jacobian.simulation.slip import Drift
 class Simulation(Protocol):
     """A simulated robot, as those who change it need it."""
 
-    def present(self) -> tuple[int, Robot]:
-        """Return the time (ns) and the robot, as they are now."""
+    def time_and_robot(self) -> tuple[int, Robot]:
+        """Return the time (ns), and the robot as of its last event until then."""
 
     def follow(self, robot: Robot) -> None:
         """Go on with another robot, of which the odometry notices nothing."""
@@ -74,7 +74,7 @@ class RobotDefects:
         """
         if not noticed:
             self._know_truth()
-        now, robot = self._simulation.present()
+        now, robot = self._simulation.time_and_robot()
         pushed = robot.pushed(displacement, now, noticed=noticed)
         if noticed:
             self._simulation.place(pushed)
@@ -91,7 +91,7 @@ class RobotDefects:
             MessageError: Simulated time has not started.
         """
         self._know_truth()
-        now, robot = self._simulation.present()
+        now, robot = self._simulation.time_and_robot()
         before, robot = self._encoders, robot.at(now)
         if before is not None:
             pose = before.read(robot).pose

@@ -211,10 +211,11 @@ class Steering:
             if command is None:
                 return pursuit, None
         # Without wheels in the limits the geometry of the wheels does not matter.
-        v, omega = scaled_to_limits.floats(*command, *self._limits, 1.0, 1.0)
+        v, omega = scaled_to_limits.floats(*command, *self._limits, r=1.0, L=1.0)
         if abs(omega) > LARGEST_TURN * rate:
             # Not a whole turn between two messages. The other direction may be forbidden.
-            v, omega = scaled_to_limits.floats(v, by_shorter_turn(omega, rate), *self._limits, 1.0, 1.0)
+            omega = by_shorter_turn(omega, rate)
+            v, omega = scaled_to_limits.floats(v, omega, *self._limits, r=1.0, L=1.0)
         if self._braking is not None:
             v, omega = self._braked(self._braking, pursuit, state, (v, omega), now, rate)
             self._braking.sent(now, (v, omega))
@@ -243,9 +244,9 @@ class Steering:
         rate: float,
     ) -> Twist:
         """Return a command from which the robot can stop at the last goal."""
-        # A turn in place moves the driven point in any case.
-        straight = pursuit.follower is not None or pursuit.waypoints.turning
-        offset = 0.0 if straight else float(self.arrival.offset)
+        # Along a path the axle centre counts, and a turn in place moves the driven point in any case.
+        of_axle = pursuit.follower is not None or pursuit.waypoints.turning
+        offset = 0.0 if of_axle else float(self.arrival.offset)
 
         def room(turn: float) -> Twist:
             if pursuit.follower is not None:

@@ -97,8 +97,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             kind, codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
             self.subscribe(kind, source, self._on_command, codec=codec, **commands)
         self.watch(topic_check(self, SEVERAL, 'odom'))
-        lost = [topic_check(self, GOALS_LOST, name) for name in ('goal_pose', 'goals')]
-        self.watch(lambda: next(filter(None, (check() for check in lost)), None))
+        for name in ('goal_pose', 'goals'):
+            self.watch(topic_check(self, GOALS_LOST, name))
         self.subscribe(
             PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, codec=POSE_WITH_COVARIANCE
         )
@@ -154,8 +154,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._robot, self._latest = robot, now
         return now, robot
 
-    def present(self) -> tuple[int, Robot]:
-        """Return the time (ns) and the robot, as they are now.
+    def time_and_robot(self) -> tuple[int, Robot]:
+        """Return the time (ns), and the robot as of its last event until then.
 
         Raises:
             MessageError: Simulated time has not started.
@@ -209,7 +209,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _on_command(self, command: Command) -> None:
         """Apply a command at its stamp, or now if it has none."""
-        now, robot = self.present()
+        now, robot = self.time_and_robot()
         (v, omega), stamp = command
         time = command_time(stamp, now, robot.stamp, robot.model.command_timeout)
         if v or omega:
@@ -228,7 +228,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _on_initial_pose(self, place: Place) -> None:
         """Place the robot now: the stamp does not matter."""
-        now, robot = self.present()
+        now, robot = self.time_and_robot()
         if place.frame not in ('', self._frame):
             raise MessageError(
                 f"its frame must be '{printable(self._frame)}', got '{printable(place.frame)}'"
@@ -239,7 +239,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
-            now, robot = self.present()
+            now, robot = self.time_and_robot()
         except MessageError as error:
             response.message = str(error)
             return response

@@ -160,7 +160,7 @@ class GoToGoalParameters(TwistParameters):
 
     def __getattr__(self, name: str) -> float:
         """Return a gain that is not among the fields: a law asks for each by its name."""
-        # Not while the fields are set.
+        # A copy is asked for more_gains itself before it has it.
         if name != 'more_gains' and name in self.more_gains.values:
             return self.more_gains.values[name]
         raise AttributeError(f'{type(self).__name__} has no attribute {name!r}')
@@ -192,6 +192,7 @@ class GoToGoalParameters(TwistParameters):
         The gains of controllers that are chosen become parameters, and stay. Raises ParameterError, too,
         if one cannot be loaded, or its gains cannot be parameters.
         """
+        # First add the gains, then split the values into those of them and of the fields.
         before = self._with_gains(values)
         known = before.declared()
         given = {name: known[name].converted(value) for name, value in values.items() if name in known}
@@ -209,6 +210,7 @@ class GoToGoalParameters(TwistParameters):
 
     def _with_gains(self, values: Mapping[str, Any]) -> GoToGoalParameters:
         """Return these with the gains of the controllers that are chosen with new values."""
+        # A gain is read as an attribute.
         more, used = self.more_gains, {*dir(type(self)), *OF_RCLPY}
         registries: tuple[Controllers[Any], ...] = self.controllers, self.path_controllers
         for known in registries:

@@ -41,8 +41,9 @@ def receiver(
 
     def receive(data: Any, info: Mapping[str, Any] | None = None) -> None:
         if numbers is not None:
-            # The EventsExecutor passes one tuple.
-            data, info = data if info is None else (data, info)
+            if info is None:
+                # The EventsExecutor passes one tuple.
+                data, info = data
             # None where the middleware does not number messages.
             numbers.number = info.get('publication_sequence_number')
         try:
@@ -54,7 +55,7 @@ def receiver(
 
     if numbers is not None:
         request_message_info(receive)
-    # Reports name a callback.
+    # Reports of lockstep name a callback.
     receive.__qualname__ = getattr(callback, '__qualname__', receive.__qualname__)
     return receive
 

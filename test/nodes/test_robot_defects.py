@@ -24,7 +24,7 @@ class Bench:
         self.placed = []
         self.defects = RobotDefects(self)
 
-    def present(self):
+    def time_and_robot(self):
         return self.now, self.robot
 
     def follow(self, robot):

@@ -211,7 +211,7 @@ def test_a_goal_is_reached_when_the_odometry_says_that_the_robot_rests(lockstep)
     assert sees(1.0, 0.5) == [(0.0, 0.0)]
     # It has rolled away.
     assert sees(0.5, 0.05) == [(0.25, 0.0)]
-    assert sees(1.0, math.nan) == [(0.0, 0.0)]
+    assert sees(1.0, math.nan) == []
     assert controller.node.waypoint == 0
     assert sees(1.0, 0.1) == [(0.0, 0.0)]
     assert controller.node.waypoint is None
