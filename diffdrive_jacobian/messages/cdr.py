@@ -47,7 +47,7 @@ _MAX_REMEMBERED = 1024
 
 
 class DecodingError(MessageError):
-    """Bytes that are not a message of the type."""
+    """Bytes that are not a message of the type, or too many."""
 
 
 class Reader:

@@ -2,8 +2,8 @@
 
 A `Codec` belongs to a type of message. It reads serialized messages field by field, see `messages.cdr`,
 without their Python classes, so that bags are read where no ROS is installed, too. It checks what it
-reads, unless the value says otherwise. What it writes it reads again as the same value, but for the
-strings, which are those of a template.
+reads, unless the value says otherwise. What it writes it reads again as the same value, but for what
+the message has not, the rounding of a heading, and strings, which are those of a template.
 """
 
 from __future__ import annotations

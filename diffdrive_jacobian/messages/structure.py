@@ -192,7 +192,7 @@ def check_plain(kind: FieldType) -> None:
 
 @cache
 def uniform_size(kind: FieldType) -> int:
-    """Return the size of each number of a value that has nothing but numbers of one size; 0: it has."""
+    """Return the size of the numbers of a value that has nothing but those of one size; else 0."""
     match kind:
         case Number():
             return kind.size
@@ -288,9 +288,9 @@ def check_readable(kind: Structure, field: str) -> None:
                 f'{name!r} is none of {list(inner)}'
             )
         found = inner[name]
-        if step != name and isinstance(found, Sequence):
-            of_each = isinstance(found.element, Structure)
-            found = found.element
+        if step != name:
+            of_each = isinstance(found, Sequence) and isinstance(found.element, Structure)
+            found = getattr(found, 'element', found)
     simple = found.element if isinstance(found, (Array, Sequence)) else found
     if not (of_each and isinstance(simple, (Number, Text)) and field.count('[]') <= 1):
         raise ValueError(

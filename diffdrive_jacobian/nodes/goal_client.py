@@ -29,7 +29,7 @@ from diffdrive_jacobian.messages.goal_status import GoalFollower, GoalState
 from diffdrive_jacobian.messages.names import is_named, node_of
 from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
-from diffdrive_jacobian.ros.topic_errors import explaining_failure
+from diffdrive_jacobian.ros.topic_errors import explaining_failure, whole_or_nothing
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
 DRIVEN_POINT_PARAMETERS = ('controller', 'offset')
@@ -52,7 +52,7 @@ def goals_message(
     poses = [PoseStamped() for _ in goals]
     for pose, goal in zip(poses, goals, strict=True):
         messages.set_pose(pose.pose, goal)
-    for pose, time_ in zip(poses, () if times is None else times.tolist(), strict=False):
+    for pose, time_ in zip(poses, times.tolist(), strict=True) if times is not None else ():
         messages.set_time(pose.header.stamp, now + nanoseconds(time_))
     message = poses[0]
     if topic != 'goal_pose':
@@ -135,6 +135,12 @@ class GoalClient(Node):  # type: ignore[misc]
         self._relative = relative
         self._send_on_odometry = False
         self._follower: GoalFollower[NDArray[np.float64]] = GoalFollower()
+        with whole_or_nothing(self):
+            self._create()
+        self._canceling: Any = None
+
+    def _create(self) -> None:
+        """Create the publisher, the subscriptions and the client."""
         with explaining_failure(self, MESSAGES[self.topic], self.topic):
             self._publisher = self.create_publisher(MESSAGES[self.topic], self.topic, 10)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -149,7 +155,6 @@ class GoalClient(Node):  # type: ignore[misc]
         # rclpy reports a name that is too long only here.
         self.resolve_service_name('cancel_goal')
         self._cancel = self.create_client(Trigger, 'cancel_goal')
-        self._canceling: Any = None
 
     @property
     def distance(self) -> float:

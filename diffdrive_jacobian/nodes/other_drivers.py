@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message
 
 from diffdrive_jacobian.messages.codecs import TWIST, TWIST_STAMPED
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.ros.graph_faults import MAX_AGE, SharedGraph, publishers_of
+from diffdrive_jacobian.ros.graph_faults import publishers_of
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 PERIOD = NANOSECONDS
@@ -37,8 +37,6 @@ class OtherDrivers:
             callback: Receives the names of the other nodes.
         """
         self._node = node
-        self._graph = SharedGraph(node)
-        self._clock = node.get_clock()
         self._publisher = publisher
         self._callback = callback
         self._active = False
@@ -51,7 +49,7 @@ class OtherDrivers:
         codec = TWIST_STAMPED if kind.__name__ == 'TwistStamped' else TWIST
         self._read = codec.reader(kind, deserialize_message)
         self.searched = 0
-        """Time of the last search (ns)."""
+        """Time of the last search (ns): `search` is due after each `PERIOD`."""
 
     @property
     def subscriptions(self) -> int:
@@ -59,29 +57,22 @@ class OtherDrivers:
         return int(self._subscribed)
 
     def start(self) -> None:
-        """Search for other drivers, now and in `search`."""
+        """Search for other drivers from now on."""
         self._active = True
-        self._search()
+        self.search(self.searched)
 
     def stop(self) -> None:
         """Ignore other drivers from now on."""
         self._active = False
 
     def search(self, now: int) -> None:
-        """Search for other drivers, at a time of the node (ns): after each `PERIOD`.
+        """Search for other drivers, at a time of the node (ns).
 
         With a timer a simulated run would take longer.
         """
         self.searched = now
-        # Runs in simulated time must be reproducible.
-        self._search(0.0 if self._clock.ros_time_is_active else MAX_AGE)
-
-    def _search(self, max_age: float = 0.0) -> None:
-        if self._subscribed:
-            return
-        self._graph.refresh(max_age)
         topic = self._publisher.topic_name
-        if self._graph.count_publishers(topic) < 2:
+        if self._subscribed or self._node.count_publishers(topic) < 2:
             return
         self._subscribed = True
         # Those until now do not arrive.

@@ -124,7 +124,7 @@ class RemoteProgress:
         """Receive the distance from the driven point to the goal (m), many times a second."""
 
     def no_odometry(self, topic: str, seconds: float) -> None:
-        """Receive that no odometry was received on a topic for so long (s), once."""
+        """Receive that no odometry was received on a topic for so long (s), once for each gap."""
 
     def standing(self, seconds: float) -> None:
         """Receive that the robot has not moved for so long (s) with the goal, once per standstill."""
@@ -389,6 +389,9 @@ class _Session:
             if client.ended:
                 break
             self._progress.waiting('the controller has not confirmed that it canceled')
+        if client.status is GoalState.SUCCEEDED:
+            # It arrived meanwhile.
+            return self._result(Result.ENDED)
         # The status may be received first.
         self._runner.spin(lambda: bool(client.cancel_answer), timeout=CONFIRMATION_PERIOD)
         answer = client.cancel_answer

@@ -244,7 +244,9 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             response.message = str(error)
             return response
         self.place(robot.placed(self._initial_pose(), np.zeros((3, 3)), now, odometry_only=True))
-        response.success, response.message = True, f'odometry was reset to {self._initial_pose()}'
+        x, y, theta = self._initial_pose()
+        response.success = True
+        response.message = f'odometry was reset to x {x:.3f}, y {y:.3f}, theta {theta:.3f}'
         return response
 
     def follow(self, robot: Robot) -> None:

@@ -8,8 +8,7 @@ and report each once.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
@@ -30,21 +29,19 @@ from diffdrive_jacobian.messages.conversion import MessageError, integer_warning
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError
 from diffdrive_jacobian.ros.graph_faults import (
     ALTERNATION_PATIENCE,
-    MAX_AGE,
     TYPE_PATIENCE,
     Interleaving,
     LastingFault,
-    SharedGraph,
     alternating_commands,
     wrong_type,
 )
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
-from diffdrive_jacobian.ros.parameters import declare, declare_new
+from diffdrive_jacobian.ros.parameters import declare, declare_new, with_overrides
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.rclpy_internals import log_info, time_reader
 from diffdrive_jacobian.ros.serialization import receiver
-from diffdrive_jacobian.ros.topic_errors import explaining_failure
+from diffdrive_jacobian.ros.topic_errors import explaining_failure, whole_or_nothing
 
 P = TypeVar('P', bound=NodeParameters)
 V = TypeVar('V')
@@ -94,11 +91,10 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         self.add_pre_set_parameters_callback(self._accept_integers)
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
-        self._graph = SharedGraph(self)
         self._checks_without_clock = 0
         self._faults: list[tuple[LastingFault, Callable[[], str | None], bool]] = []
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(WATCH_PERIOD, lambda: self._check_graph(MAX_AGE), clock=steady)
+        self.create_timer(WATCH_PERIOD, self._check_graph, clock=steady)
 
     # --- For subclasses
 
@@ -117,11 +113,11 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             ParameterError: The topic has another type in this process, or `qos_overrides` are invalid.
                 The node is destroyed.
         """
-        self.watch(wrong_type(self, topic, message, subscribed=False), TYPE_PATIENCE, error=True)
         profile = QoSProfile(depth=10)
         if latched:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        with self._creating(message, topic):
+        with whole_or_nothing(self), explaining_failure(self, message, topic):
+            self.watch(wrong_type(self, topic, message, subscribed=False), TYPE_PATIENCE, error=True)
             return self.create_publisher(
                 message,
                 topic,
@@ -167,10 +163,10 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 what = topic if isinstance(error, DecodingError) else called or topic
                 self.get_logger().warning(f'{what} dropped: {error}')
 
-        self.watch(wrong_type(self, topic, message, subscribed=True), TYPE_PATIENCE, error=True)
-        if numbers is not None:
-            self.watch(alternating_commands(self, topic, numbers), ALTERNATION_PATIENCE)
-        with self._creating(message, topic):
+        with whole_or_nothing(self), explaining_failure(self, message, topic):
+            self.watch(wrong_type(self, topic, message, subscribed=True), TYPE_PATIENCE, error=True)
+            if numbers is not None:
+                self.watch(alternating_commands(self, topic, numbers), ALTERNATION_PATIENCE)
             return self.create_subscription(
                 message,
                 topic,
@@ -180,21 +176,12 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 raw=True,
             )
 
-    @contextmanager
-    def _creating(self, message: type, topic: str) -> Iterator[None]:
-        """Explain why a topic cannot be created, and leave no half of a node in the graph."""
-        try:
-            with explaining_failure(self, message, topic):
-                yield
-        except BaseException:
-            self.destroy_node()
-            raise
-
     def provide(self, service: Any, name: str, callback: Callable[[Any, Any], Any]) -> Service:
-        """Create a service. Raise RuntimeError if its name is invalid."""
-        # create_service raises UnboundLocalError for an invalid name.
-        self.resolve_service_name(name)
-        return self.create_service(service, name, callback)
+        """Create a service. Raise RuntimeError if its name is invalid; the node is destroyed."""
+        with whole_or_nothing(self):
+            # create_service raises UnboundLocalError for an invalid name.
+            self.resolve_service_name(name)
+            return self.create_service(service, name, callback)
 
     @staticmethod
     def flush(publisher: Publisher) -> None:
@@ -252,10 +239,12 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
     def _apply_parameters(self, changes: list[Parameter]) -> None:
         previous = self.parameters
         self.parameters = new = previous.changed({one.name: one.value for one in changes})
-        # Declaring further ones calls this again, with the values that they have.
-        if new != previous:
-            self.parameters = declare_new(self, previous, new)
-            self.parameters_changed(previous)
+        if new == previous:
+            return
+        self.parameters = with_overrides(self, previous, new)
+        # This calls `_apply_parameters` again, with the values that they have.
+        declare_new(self, previous, self.parameters)
+        self.parameters_changed(previous)
 
     # --- Checks
 
@@ -271,9 +260,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         """
         self._faults.append((LastingFault(patience), check, error))
 
-    def _check_graph(self, max_age: float = 0.0) -> None:
+    def _check_graph(self) -> None:
         self._check_clock()
-        self._graph.refresh(max_age)
         for fault, check, error in self._faults:
             report = fault.check(check())
             # The level of a line of code cannot change in rclpy.

@@ -65,20 +65,27 @@ def declare(node: Node, defaults: P) -> P:
     return initial
 
 
-def declare_new(node: Node, before: P, after: P) -> P:
-    """Declare the parameters that a change of others has added, and return all of them.
+def with_overrides(node: Node, before: P, after: P) -> P:
+    """Return parameters with the values that the user gave for those that were not there before.
 
-    The new ones have the values that the user gave. An invalid value is ignored, with a warning.
+    An invalid value is ignored, with a warning.
     """
-    new = after.declared().keys() - before.declared().keys()
     overrides = parameter_overrides(node)
-    for name in sorted(new & overrides.keys()):
+    for name in sorted(_new(before, after) & overrides.keys()):
         try:
             after = after.changed({name: overrides[name].value})
         except ParameterError as error:
             node.get_logger().warning(f'{error}; the default is used')
-    _declare(node, after, new)
     return after
+
+
+def declare_new(node: Node, before: NodeParameters, after: NodeParameters) -> None:
+    """Declare the parameters that a change of others has added."""
+    _declare(node, after, _new(before, after))
+
+
+def _new(before: NodeParameters, after: NodeParameters) -> set[str]:
+    return after.declared().keys() - before.declared().keys()
 
 
 def _declare(node: Node, parameters: NodeParameters, names: Iterable[str]) -> None:

@@ -65,7 +65,8 @@ def publisher_profile(recorded: Sequence[Qos], depth: int) -> QoSProfile:
         profile.reliability = ReliabilityPolicy.BEST_EFFORT
     if any(one.durability == QosDurability.TRANSIENT_LOCAL for one in recorded):
         profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-    deadlines = [one.deadline for one in recorded]
+    # 0 means none.
+    deadlines = [one.deadline for one in recorded if one.deadline != QosTime(0, 0)]
     if deadlines:
         shortest = min(deadlines)
         profile.deadline = Duration(seconds=shortest.sec, nanoseconds=shortest.nsec)

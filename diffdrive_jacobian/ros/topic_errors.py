@@ -15,6 +15,16 @@ from diffdrive_jacobian.text import printable
 
 
 @contextmanager
+def whole_or_nothing(node: Node) -> Iterator[None]:
+    """Destroy a node if it cannot be completed: half of one would stay in the graph."""
+    try:
+        yield
+    except BaseException:
+        node.destroy_node()
+        raise
+
+
+@contextmanager
 def explaining_failure(node: Node, message: type, topic: str) -> Iterator[None]:
     """Explain why rclpy cannot create a publisher or a subscription of a node.
 

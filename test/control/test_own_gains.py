@@ -89,6 +89,18 @@ def test_a_change_that_declares_gains_is_one_change(lockstep, site, monkeypatch)
     assert len(changes) == 1
 
 
+def test_a_change_that_declares_gains_knows_what_the_user_gave(lockstep, site, monkeypatch):
+    site.install('polar')
+    node, seen = lockstep.add(make(GoToGoal, k_rho=0.7, k_beta=-2.0)), []
+    monkeypatch.setattr(
+        node,
+        'parameters_changed',
+        lambda _: seen.append((node.parameters.k_rho, node.parameters.k_beta)),
+    )
+    assert change(node, controller='polar').successful
+    assert seen == [(0.7, -2.0)]
+
+
 def test_the_default_of_a_shared_gain_is_that_of_the_controller_chosen():
     own = replace(INTEGRAL, gains=(replace(KP, default=1.5), *INTEGRAL.gains[1:]))
     assert GoToGoalParameters().with_controller(own).at_start({}).kp == 1.5

@@ -27,7 +27,7 @@ LIMITS = {
     'batch': {'calls': 88, 'functions': 26, 'files': 7},
     # The start of a program: modules of the package, and all. A ROS installation may have fewer.
     'virtual_robot': {'own modules': 59, 'modules': 500},
-    'go_to_goal': {'own modules': 77, 'modules': 500},
+    'go_to_goal': {'own modules': 77, 'modules': 502},
     'wheel_bridge': {'own modules': 59, 'modules': 495},
 }
 BYTECODES = {

@@ -13,6 +13,7 @@ from nav_msgs.msg import Goals, Odometry
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 from support.ros_messages import goal, goals, odometry, receive, value_of
@@ -247,7 +248,8 @@ class MuteController(Node):
     def __init__(self, context):
         super().__init__('mute', context=context)
         self.heard = []
-        self.create_publisher(GoalStatus, 'goal_status', 1)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._status = self.create_publisher(GoalStatus, 'goal_status', latched)
         self.create_subscription(PoseStamped, 'goal_pose', lambda _: self.heard.append('goal'), 10)
         self.create_service(Trigger, 'cancel_goal', self._on_cancel)
 
@@ -264,6 +266,34 @@ def test_a_goal_without_an_answer_is_withdrawn():
         runner.settle()
     assert result.result is Result.NO_ANSWER
     assert mute.heard == ['goal', 'cancel']
+
+
+class LateController(MuteController):
+    """Drives to a goal, and has arrived when it is asked to cancel."""
+
+    def __init__(self, context):
+        super().__init__(context)
+        self.create_subscription(PoseStamped, 'goal_pose', self._on_goal, 10)
+
+    def _on_goal(self, goal):
+        self._goal = goal
+        self._report(GoalStatus.STATUS_EXECUTING)
+
+    def _report(self, status):
+        message = GoalStatus(status=status)
+        message.goal_info.stamp = self._goal.header.stamp
+        self._status.publish(message)
+
+    def _on_cancel(self, request, response):
+        self._report(GoalStatus.STATUS_SUCCEEDED)
+        return super()._on_cancel(request, response)
+
+
+def test_a_robot_that_arrives_while_it_is_canceled_has_arrived():
+    with in_lockstep() as runner:
+        runner.add(lambda: LateController(runner.context))
+        result = send_goal([1.0, 0.0, 0.0], runner=runner, timeout=1.0)
+    assert (result.result, result.arrived, result.canceled) == (Result.ENDED, True, None)
 
 
 # --- Robots that have a goal and do not move

@@ -5,12 +5,14 @@ from __future__ import annotations
 import sys
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 from rclpy.logging import get_logger
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep.runner import running_in_lockstep
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros.runner import UserError, make_executor, ros_context, running
@@ -111,12 +113,19 @@ def test_every_node_is_stopped_before_any_is_destroyed():
 
 def test_a_node_that_cannot_be_created_leaves_nothing_in_the_graph():
     override = 'qos_overrides./odom.publisher.depth:=-1'
+    name = 240 * 'n'
     with (
-        ros_context(['test', '--ros-args', '-p', override]) as context,
+        ros_context(
+            ['test', '--ros-args', '-p', override, '-r', f'cancel_goal:=/a/{name}/b']
+        ) as context,
         running(context, isolated=True) as runner,
     ):
         with pytest.raises(UserError, match='qos_overrides of /odom are invalid'):
             runner.add(lambda: VirtualRobot(context=context))
+        with pytest.raises(UserError):
+            runner.add(lambda: GoToGoal(context=context, namespace=name))
+        with pytest.raises(UserError):
+            runner.add(lambda: GoalClient('client', np.zeros((1, 3)), context, namespace=name))
         observer = runner.add(lambda: Node('observer', context=context))
         assert observer.get_node_names() == ['observer']
 
