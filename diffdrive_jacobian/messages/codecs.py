@@ -91,7 +91,14 @@ class Codec(Generic[V]):
         return Reader(kind, self.fields, self.value, deserialize=deserialize)
 
     def writer(self, template: Any) -> Writer:
-        """Return what serializes values, with the strings and the lengths of a template."""
+        """Return what serializes values, with the strings and the lengths of a template.
+
+        ValueError: it is only read.
+        """
+        if not self.written:
+            raise ValueError(
+                f'a codec that writes must be given, got one that only reads {self.type_name}'
+            )
         return Writer(template, self.written, self.numbers)
 
 

@@ -20,6 +20,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import Arrival, Path
+from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.control.path import PathProgress
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.messages import conversion as messages
@@ -313,7 +314,6 @@ def driven_offset(values: Mapping[str, Any]) -> float:
 
     It is in the body frame; 0: the axle centre. Invalid values, of any node, count as missing.
     """
-    offset = values.get('offset')
-    if values.get('controller') != 'offset_point' or not isinstance(offset, float):
-        return 0.0
-    return offset if math.isfinite(offset) else 0.0
+    controller = CONTROLLERS.built_in.get(str(values.get('controller')))
+    offset = None if controller is None else values.get(controller.offset)
+    return offset if isinstance(offset, float) and math.isfinite(offset) else 0.0

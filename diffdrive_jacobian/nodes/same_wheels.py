@@ -87,4 +87,4 @@ def wheels_of(response: Any) -> Dimensions | None:
     values = response.values
     if len(values) != len(WHEELS) or any(one.type != ParameterType.PARAMETER_DOUBLE for one in values):
         return None
-    return Dimensions.of(*(float(one.double_value) for one in values))
+    return Dimensions.of(float(one.double_value) for one in values)

@@ -220,7 +220,7 @@ class WheelParameters(TwistParameters):
     @property
     def dimensions(self) -> Dimensions:
         """Dimensions of the wheels."""
-        return Dimensions.of(*(getattr(self, name) for name in WHEELS))
+        return Dimensions.of(getattr(self, name) for name in WHEELS)
 
     @property
     def wheel_names(self) -> tuple[str, str]:

@@ -217,7 +217,7 @@ class GoToGoalParameters(TwistParameters):
             name = values.get(known.parameter, getattr(self, known.parameter))
             if name in known and name not in known.built_in:
                 what = f"parameter '{known.parameter}': {name!r}"
-                more = more.of(_found(known, name), what, GAINS, used)
+                more = more.with_gains_of(_found(known, name), what, GAINS, used)
         return self if more == self.more_gains else replace(self, more_gains=more)
 
     def limits(self, default: float = MAX_SPEED) -> VelocityLimits:

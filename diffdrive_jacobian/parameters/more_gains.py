@@ -37,7 +37,7 @@ class MoreGains:
             for gain in self.gains
         }
 
-    def of(
+    def with_gains_of(
         self, controller: ControlLaw, what: str, built_in: Mapping[str, Gain], used: Collection[str]
     ) -> MoreGains:
         """Return these and the gains of a controller, with their defaults.

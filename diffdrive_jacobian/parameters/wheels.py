@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 WHEELS = (
@@ -25,9 +26,15 @@ class Dimensions(NamedTuple):
     separation: float
 
     @classmethod
-    def of(cls, r: float, right: float, left: float, L: float, separation: float) -> Dimensions:
+    def of(cls, values: Iterable[float]) -> Dimensions:
         """Return those of the values of WHEELS."""
-        return cls(right * r, left * r, separation * L)
+        named = dict(zip(WHEELS, values, strict=True))
+        radius = named['wheel_radius']
+        return cls(
+            named['right_wheel_radius_multiplier'] * radius,
+            named['left_wheel_radius_multiplier'] * radius,
+            named['wheel_separation_multiplier'] * named['wheel_separation'],
+        )
 
 
 def different_wheels(computed: Dimensions, name: str, driven: Dimensions) -> str:

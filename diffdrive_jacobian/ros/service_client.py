@@ -69,13 +69,13 @@ class ServiceClient:
         """Whether there is a server."""
         return bool(self._client.service_is_ready())
 
-    def call(self, request: Any, on_response: Callable[[Any], object], on_failure: OnFailure) -> None:
+    def call(self, request: Any, on_answer: Callable[[Any], object], on_failure: OnFailure) -> None:
         """Send a request. `on_failure` is called if no response comes in time, or none can be read."""
         future = self._client.call_async(request)
         self._calls[future] = self._monotonic() + self._patience, on_failure
-        future.add_done_callback(partial(self._on_done, on_response))
+        future.add_done_callback(partial(self._on_done, on_answer))
 
-    def _on_done(self, on_response: Callable[[Any], object], future: Future) -> None:
+    def _on_done(self, on_answer: Callable[[Any], object], future: Future) -> None:
         if future not in self._calls:
             # The response is too late.
             return
@@ -85,7 +85,7 @@ class ServiceClient:
             why = printable(reason(future.exception() or RuntimeError('canceled')))
             on_failure(f'its answer cannot be read: {why}')
         else:
-            on_response(future.result())
+            on_answer(future.result())
 
     def advance(self) -> None:
         """End the calls that have waited too long; to be called often."""
