@@ -207,14 +207,15 @@ class Place(NamedTuple):
 
 
 def _motion(sec: int, nanosec: int, frame: str, *values: Any) -> Motion:
-    *numbers, of_pose, of_twist = values
-    motion = _motion_alone(sec, nanosec, frame, *numbers)
-    return motion._replace(covariance=_planar(of_pose), twist_covariance=_forward_and_yaw(of_twist))
-
-
-def _motion_alone(sec: int, nanosec: int, frame: str, *values: float) -> Motion:
-    pose, twist = values[:6], values[6:]
-    return Motion(from_time(sec, nanosec), from_pose(*pose), from_twist(*twist), frame=frame)
+    *pose_and_twist, of_pose, of_twist = values
+    return Motion(
+        from_time(sec, nanosec),
+        from_pose(*pose_and_twist[:6]),
+        from_twist(*pose_and_twist[6:]),
+        _planar(of_pose),
+        _forward_and_yaw(of_twist),
+        frame,
+    )
 
 
 def _motion_numbers(motion: Motion) -> tuple[float, ...]:
@@ -261,12 +262,6 @@ ODOMETRY = Codec(
     ),
     _motion_numbers,
 )
-MOTION = Codec(
-    'nav_msgs/msg/Odometry',
-    ODOMETRY.fields[:-2],
-    _motion_alone,
-)
-"""Odometry without its covariances."""
 ODOMETRY_STATE = Codec(
     'nav_msgs/msg/Odometry',
     (

@@ -179,7 +179,7 @@ TOPICS = {
         ),
         Topic(
             name='ground_truth',
-            codecs=(codecs.MOTION,),
+            codecs=(codecs.ODOMETRY,),
             table=Recorded(series='ground_truth', columns=_POSE + _TWIST, rows=_motion),
             followed=True,
         ),

@@ -20,7 +20,7 @@ from support.ros_messages import goal, goals, odometry, receive, value_of
 
 from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.drives import in_lockstep, overrides
-from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, MOTION, PARAMETER_EVENT
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, ODOMETRY, PARAMETER_EVENT
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, driven_offset
@@ -361,7 +361,7 @@ EVENT = ParameterEvent(changed_parameters=[Parameter('a', value=[1, 2]).to_param
     ('codec', 'message'),
     [
         (GOAL_STATUS, GoalStatus()),
-        (MOTION, odometry(1.0, 2.0, 0.0)),
+        (ODOMETRY, odometry(1.0, 2.0, 0.0)),
         (GOALS, goals(goal(1, 0), goal(2, 0))),
         (PARAMETER_EVENT, EVENT),
     ],
@@ -384,7 +384,7 @@ def test_invalid_messages_are_ignored_without_a_word(codec, message, capfd):
 
 def test_an_invalid_value_is_reported_and_what_is_too_large_is_not():
     received, refused = [], []
-    callback = ignoring_invalid(MOTION, Odometry, received.append, refused.append)
+    callback = ignoring_invalid(ODOMETRY, Odometry, received.append, refused.append)
     callback(serialize_message(odometry(1e7, 0.0, 0.0)))
     callback(serialize_message(Odometry(child_frame_id='a' * serialization.MAX_SIZE)))
     assert received == []
