@@ -135,7 +135,7 @@ def report(result: GoalResult, options: argparse.Namespace, what: str) -> list[s
         Result.UNCONFIRMED: f'sent, but not acknowledged by every subscription to {result.topic}',
         Result.SENT: f'sent: {what} on {result.topic}',
         Result.NO_ANSWER: f'no answer: the controller published no goal_status within '
-        f'{ANSWER_PATIENCE:g} s',
+        f'{ANSWER_PATIENCE:g} s; it was asked to cancel the goal',
         Result.ENDED: f'{result.status.word}{where}{reasons.get(result.status, "")}',
         Result.LOST: f'lost: {result.reason}{where}',
         Result.TIMEOUT: f'not arrived within --timeout {options.timeout:g} s{where}',
