@@ -37,6 +37,7 @@ from diffdrive_jacobian.numerics.checks import (
     optional,
     short,
 )
+from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Law = Callable[..., tuple[Any, ...]]
@@ -46,6 +47,8 @@ GainValues = Any
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_.-]{0,63}')
 _GAIN = re.compile(r'[a-z][a-z0-9_]{0,31}')
 LARGEST_GAIN = 100.0
+LONGEST_TEXT = 500
+"""Longest text of a law that is passed on (characters)."""
 
 
 class LawError(DiffdriveError, ValueError):
@@ -213,7 +216,7 @@ class ControlLaw(Checked):
     def warnings(self, gains: GainValues, limits: VelocityLimits) -> list[str]:
         """Return the warnings about gains or limits; a failure of `advice` is one of them."""
         try:
-            return [str(text) for text in self.advice(gains, limits)]
+            return [printable(str(text), LONGEST_TEXT) for text in self.advice(gains, limits)]
         except Exception as error:
             return [f'the advice of controller {self.name!r} failed: {_reason(error)}']
 
@@ -360,7 +363,7 @@ class BoundLaw:
                 v, omega = found
             if not (type(v) is type(omega) is float and isfinite(v) and isfinite(omega)):
                 v, omega = _number(v), _number(omega)
-        except (OverflowError, TypeError, ValueError) as error:
+        except Exception as error:
             also = f', and the state, shape ({len(self._state)},)' if self._state else ''
             raise LawError(
                 f'the law of controller {controller.name!r} must return (v, omega), two finite '
@@ -379,6 +382,6 @@ def _number(value: Any) -> float:
 
 def _reason(error: Exception) -> str:
     """Return kind, message and place of an exception in one line."""
-    text = traceback.format_exception_only(type(error), error)[-1].strip()
+    text = printable(traceback.format_exception_only(type(error), error)[-1].strip(), LONGEST_TEXT)
     *_, last = traceback.extract_tb(error.__traceback__)
     return f'{text} ({Path(last.filename).name}, line {last.lineno})'

@@ -19,12 +19,14 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from diffdrive_jacobian.messages.cdr import Reader, Writer
 from diffdrive_jacobian.messages.conversion import (
     MAX_PATH_POSES,
+    MAX_SPEED,
     MAX_WAYPOINTS,
     MessageError,
     from_joints,
     from_pose,
     from_time,
     from_twist,
+    plausible_twist,
     quoted,
 )
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -190,7 +192,7 @@ class State(NamedTuple):
     pose: tuple[float, float, float]
     """`(x, y, theta)` (m, m, rad)."""
     twist: tuple[float, float]
-    """`(v, omega)` in the body frame (m/s, rad/s), finite."""
+    """`(v, omega)` in the body frame (m/s, rad/s), plausible."""
 
 
 class Place(NamedTuple):
@@ -231,8 +233,8 @@ def _place_numbers(place: Place) -> tuple[float, ...]:
 
 
 def _state(frame: str, sec: int, nanosec: int, v: float, omega: float, *pose: float) -> State:
-    if not math.isfinite(v + omega):
-        raise MessageError(f'twist must be finite, got v {v:g}, omega {omega:g}')
+    if not (abs(v) <= MAX_SPEED and abs(omega) <= MAX_SPEED):
+        plausible_twist(v, omega)
     return State((sec, nanosec), frame, from_pose(*pose), (v, omega))
 
 

@@ -204,7 +204,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if goal is None:
             return
         topic, timeout = self.resolve_topic_name('odom'), self.parameters.odom_timeout
-        goal.stale = goal.executing
+        goal.stale = goal.stale or goal.executing
         if self._driving:
             self._stop_robot()
             self.log_event_warning(

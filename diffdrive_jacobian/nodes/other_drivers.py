@@ -24,8 +24,8 @@ REMEMBERED = 64
 class OtherDrivers:
     """Calls a function when another node sends a command that is not zero.
 
-    It is subscribed to the commands only once another node publishes them. So its usual cost is that of
-    remembering a command.
+    A command that equals one of the last own ones counts as own. It is subscribed to the commands only
+    once another node publishes them. So its usual cost is that of remembering a command.
     """
 
     def __init__(self, node: Node, publisher: Publisher, callback: Callable[[list[str]], None]) -> None:
@@ -41,7 +41,7 @@ class OtherDrivers:
         self._callback = callback
         self._active = False
         self._subscribed = False
-        # Serialized, as they arrive again, each once.
+        # Serialized, as they arrive again, perhaps several times.
         self._sent: deque[bytes] = deque(maxlen=REMEMBERED)
         self.sent = self._sent.append
         """Remember a serialized command of the node itself."""
@@ -75,22 +75,14 @@ class OtherDrivers:
         if self._subscribed or self._node.count_publishers(topic) < 2:
             return
         self._subscribed = True
-        # Those until now do not arrive.
-        self._sent.clear()
         # Best effort matches every publisher, whatever its quality of service.
         profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         kind = self._publisher.msg_type
         self._node.create_subscription(kind, topic, self._on_command, profile, raw=True)
 
     def _on_command(self, data: bytes) -> None:
-        try:
-            # One of them; another node may send the same command.
-            self._sent.remove(data)
-        except ValueError:
-            if self._active:
-                self._on_command_of_others(data)
-
-    def _on_command_of_others(self, data: bytes) -> None:
+        if not self._active or data in self._sent:
+            return
         try:
             v, omega = self._read(data).twist
         except MessageError:

@@ -284,7 +284,7 @@ class _Session:
         if client.ended:
             return self._result(Result.ENDED)
         if lost is not None:
-            # A controller that only hangs receives it when it resumes: nobody follows the goal then.
+            # A controller that only hangs may receive it when it resumes: nobody follows the goal then.
             client.cancel()
             return self._result(Result.LOST, reason=lost)
         return self._cancel(Result.INTERRUPTED if signals.count else Result.TIMEOUT)

@@ -5,6 +5,7 @@ With other dimensions a robot drives at another speed than commanded, and nothin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -16,7 +17,7 @@ from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.messages.names import is_named, node_of
 from diffdrive_jacobian.parameters.wheels import WHEELS, Dimensions, different_wheels
-from diffdrive_jacobian.ros.service_client import ServiceClient
+from diffdrive_jacobian.ros.service_client import ServiceClient, is_possible
 
 PATIENCE = 5.0
 """Longest wait for an answer (s)."""
@@ -67,9 +68,11 @@ class SameWheels:
     def _find(self) -> dict[str, ServiceClient]:
         found = self._node.get_subscriptions_info_by_topic(self._speeds.topic_name)
         names = sorted({node_of(one) for one in found if is_named(one)})[:MOST]
+        services = {name: f'{name}/get_parameters' for name in names}
         return {
-            name: ServiceClient(self._node, GetParameters, f'{name}/get_parameters', patience=PATIENCE)
-            for name in names
+            name: ServiceClient(self._node, GetParameters, service, patience=PATIENCE)
+            for name, service in services.items()
+            if is_possible(service)
         }
 
     def _on_answer(self, name: str, response: Any) -> None:
@@ -83,8 +86,11 @@ class SameWheels:
 
 
 def wheels_of(response: Any) -> Dimensions | None:
-    """Return the wheels in the answer to a request for WHEELS. None: the node has none."""
+    """Return the wheels in the answer to a request for WHEELS. None: the node has no valid ones."""
     values = response.values
     if len(values) != len(WHEELS) or any(one.type != ParameterType.PARAMETER_DOUBLE for one in values):
         return None
-    return Dimensions.of(float(one.double_value) for one in values)
+    numbers = [float(one.double_value) for one in values]
+    found = Dimensions.of(numbers)
+    # Of any node, and anything.
+    return found if all(0.0 < one < math.inf for one in (*numbers, *found)) else None

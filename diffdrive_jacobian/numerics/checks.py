@@ -56,7 +56,7 @@ def short(value: Any, express: Callable[[Any], str] = str) -> str:
     """Return a value as text of at most 60 characters."""
     try:
         got = express(value)
-    except ValueError:  # of an integer with thousands of digits
+    except Exception:  # of an integer with thousands of digits, or of an object of others
         got = f'an object of class {type(value).__name__}'
     return got if len(got) <= 60 else f'{got[:57]}...'
 

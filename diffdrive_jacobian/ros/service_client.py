@@ -10,9 +10,11 @@ from functools import partial
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters
+from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.task import Future
+from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from diffdrive_jacobian.ros.rclpy_internals import on_response, reason
 from diffdrive_jacobian.text import printable
@@ -24,12 +26,23 @@ PERIOD = 0.5
 """Time between two requests of `Liveness` (s)."""
 LONGEST_STEP = 0.2
 """At most so much time counts between two calls of `Liveness.silence` (s)."""
+MAX_NAME = 240
+"""Longest name of a service of another node for which a client is created (characters)."""
 PENDING = 20
 """Requests without an answer that are kept. A late answer counts as well."""
 
 
 def ignore(_: str) -> None:
     """Ignore that there is no response."""
+
+
+def is_possible(name: str) -> bool:
+    """Return whether a service can have this fully qualified name: that of a node may be too long."""
+    try:
+        validate_full_topic_name(name, is_service=True)
+    except NameValidationException:
+        return False
+    return len(name) <= MAX_NAME
 
 
 class ServiceClient:
@@ -130,8 +143,11 @@ class Liveness:
             parameters: Names of the parameters that are requested.
             monotonic: As for `ServiceClient`.
         """
+        services = {name: f'{name}/get_parameters' for name in names}
         self._clients = {
-            name: node.create_client(GetParameters, f'{name}/get_parameters') for name in names
+            name: node.create_client(GetParameters, service)
+            for name, service in services.items()
+            if is_possible(service)
         }
         self._monotonic = monotonic
         self._responses: dict[str, Counter[int]] = {name: Counter() for name in self._clients}

@@ -85,8 +85,11 @@ def test_a_single_goal_has_the_frame_and_a_status(ros):
     ros.until(lambda: client.status == GoalStatus.STATUS_ACCEPTED, 'the goal is accepted')
     assert received[0].header.frame_id == 'odom'
     assert not client.ended
+    assert client.cancel_answer == ''
     client.cancel()
     ros.until(lambda: client.ended, 'the goal is canceled')
+    ros.until(lambda: client.cancel_answer, 'the controller answers')
+    assert client.cancel_answer == 'goal canceled, zero sent'
 
 
 def test_invalid_goals_and_topics_are_named(ros):

@@ -25,6 +25,7 @@ from support.ros_messages import goal, goals, odometry, path, pose_of, spoiled, 
 
 from diffdrive_jacobian.control import Path, PathController
 from diffdrive_jacobian.control.controllers import ALL_PATH_CONTROLLERS
+from diffdrive_jacobian.drives import overrides
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -211,8 +212,30 @@ def test_the_same_path_again_while_odometry_is_missing_is_resumed(lockstep, cont
     lockstep.run_for(1.0)
     assert 'robot stopped, waiting' in capfd.readouterr().err
     controller.send(STRAIGHT)
+    lockstep.run_for(1.0)
     assert controller.at(0.2, 0.0) == (0.2, 0.0)
     assert 'odometry is received again' in capfd.readouterr().err
+
+
+def test_a_law_of_paths_with_a_state_begins_anew_after_the_robot_has_stood(lockstep):
+    steps = []
+
+    def law(pose, reference, *, state, dt):
+        steps.append((state[0], dt))
+        return 0.1, 0.0, [state[0] + 1.0]
+
+    own = PathController(name='counting', law=law, gains=(), state=(0.0,))
+    lockstep.listen(GoalStatus, 'goal_status')
+    lockstep.add(GoToGoal(path_controller=own, parameter_overrides=overrides({'odom_timeout': 0.3})))
+    lockstep.publish('path', STRAIGHT)
+    for x in (0.0, 0.1):
+        lockstep.publish('odom', odometry(x, 0.0, 0.0))
+        lockstep.run_for(0.1)
+    lockstep.run_for(0.5)
+    lockstep.publish('path', STRAIGHT)
+    lockstep.run_for(0.5)
+    lockstep.publish('odom', odometry(0.2, 0.0, 0.0))
+    assert steps == [(0.0, 0.0), (1.0, pytest.approx(0.1)), (0.0, 0.0)]
 
 
 def test_goal_and_path_replace_each_other_and_cancel_stops(lockstep, controller):

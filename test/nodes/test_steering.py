@@ -107,6 +107,7 @@ def test_a_robot_does_not_turn_by_more_than_a_half_turn_between_two_messages():
 def test_a_path_may_begin_only_so_far_from_the_robot():
     pursuit = Pursuit.of(path((1, 0), (2, 0)))
     assert steering(max_path_distance=1.0).begin(pursuit, (0.0, 0.0, 0.0)) is pursuit
+    assert steering(max_path_distance=0.6).begin(pursuit, (0.5, 0.3, 0.0)) is pursuit
     with pytest.raises(ValueError, match=r'within max_path_distance, 0\.9 m, of the robot, got 1 m'):
         steering(max_path_distance=0.9).begin(pursuit, (0.0, 0.0, 0.0))
 

@@ -18,6 +18,8 @@ from diffdrive_jacobian.faults import TimeJump
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.parameters.wheels import WHEELS as WHEEL_PARAMETERS
+from diffdrive_jacobian.ros.service_client import Liveness
 from diffdrive_jacobian.simulation import Robot
 from diffdrive_jacobian.simulation.actuators import Actuators
 
@@ -202,6 +204,30 @@ def test_a_robot_with_other_wheels_is_warned_of_once(lockstep, capfd, robot, bri
     assert said is None or said in text
     # Nothing is left of the question.
     assert len(list(node.clients)) == before
+
+
+@pytest.mark.parametrize('value', [0.0, -1.0, math.nan, math.inf])
+def test_wheels_that_cannot_be_are_not_compared(lockstep, capfd, value):
+    other = lockstep.add(Node('other'))
+    other.declare_parameters('', [(name, value) for name in WHEEL_PARAMETERS])
+    other.create_subscription(JointState, 'joint_command', lambda _: None, 10)
+    lockstep.add(WheelBridge())
+    for _ in range(4):
+        lockstep.publish('cmd_vel', twist(0.2))
+        lockstep.run_for(0.1)
+    assert 'instead of' not in capfd.readouterr().err
+
+
+def test_a_node_whose_name_leaves_no_room_for_services_is_not_asked(lockstep):
+    without = overrides({'start_type_description_service': False})
+    name = 245 * 'n'
+    other = lockstep.add(Node(name, start_parameter_services=False, parameter_overrides=without))
+    other.create_subscription(JointState, 'joint_command', lambda _: None, 10)
+    lockstep.add(WheelBridge())
+    for _ in range(4):
+        lockstep.publish('cmd_vel', twist(0.2))
+        lockstep.run_for(0.1)
+    assert Liveness(lockstep.node, [f'/{name}']).silence() == 0.0
 
 
 def test_the_wheels_are_those_when_the_robot_answers(lockstep, capfd):
