@@ -30,6 +30,12 @@ VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 SWITCH = 'DIFFDRIVE_JACOBIAN_FAST_DISCOVERY'
 """Environment variable that switches frequent announcements off if it is 0."""
 _FOLDER = os.path.join(os.path.dirname(os.path.abspath(__file__)), 'fastdds')
+_FILES = {
+    os.path.join(_FOLDER, 'announcements.xml'): {'announcements'},
+    os.path.join(_FOLDER, 'heartbeats.xml'): {'heartbeats'},
+    os.path.join(_FOLDER, 'announcements_heartbeats.xml'): {'announcements', 'heartbeats'},
+}
+"""The files, and the profiles in each."""
 # Other names of the variable, how Fast DDS is told to ignore files, and servers, which replace
 # announcements.
 _CHOICES = (
@@ -39,7 +45,7 @@ _CHOICES = (
 TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
 """Environment variable of Fast DDS that names its transports."""
 _WITH_UDP = ('', 'DEFAULT', 'UDPv4')
-_FILES = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
+_DEFAULTS = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
 
 
 def announce_frequently() -> bool:
@@ -80,7 +86,7 @@ def for_other_process() -> dict[str, str]:
 
 def withdraw() -> None:
     """Remove the variable when the first participant exists: other processes must not inherit it."""
-    if _own() is not None:
+    if _own():
         del os.environ[VARIABLE]
 
 
@@ -89,8 +95,7 @@ def _use(profile: str) -> bool:
     present = _own()
     if present is None and _user_has_chosen():
         return False
-    names = sorted({profile, *(present or [])})
-    file = os.path.join(_FOLDER, f'{"_".join(names)}.xml')
+    (file,) = (one for one, profiles in _FILES.items() if profiles == {profile, *(present or ())})
     if not os.access(file, os.R_OK):
         # Packed without its data files. Fast DDS would report that as an error.
         return False
@@ -98,10 +103,9 @@ def _use(profile: str) -> bool:
     return True
 
 
-def _own() -> list[str] | None:
+def _own() -> set[str] | None:
     """Return the profiles in the file that the variable names. None: it is no file of this package."""
-    folder, file = os.path.split(os.environ.get(VARIABLE, ''))
-    return os.path.splitext(file)[0].split('_') if folder == _FOLDER else None
+    return _FILES.get(os.environ.get(VARIABLE, ''))
 
 
 def _user_has_chosen() -> bool:
@@ -112,5 +116,5 @@ def _user_has_chosen() -> bool:
         any(os.environ.get(name) for name in _CHOICES)
         or transports not in _WITH_UDP
         or not (not middleware or middleware.startswith('rmw_fastrtps'))
-        or any(os.path.exists(file) for file in _FILES)
+        or any(os.path.exists(file) for file in _DEFAULTS)
     )
