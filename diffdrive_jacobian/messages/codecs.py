@@ -233,6 +233,7 @@ def _place_numbers(place: Place) -> tuple[float, ...]:
 
 
 def _state(frame: str, sec: int, nanosec: int, v: float, omega: float, *pose: float) -> State:
+    # Not a call for each message.
     if not (abs(v) <= MAX_SPEED and abs(omega) <= MAX_SPEED):
         plausible_twist(v, omega)
     return State((sec, nanosec), frame, from_pose(*pose), (v, omega))

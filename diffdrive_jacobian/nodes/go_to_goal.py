@@ -161,7 +161,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             return
         if goal.stale:
             goal.stale = False
-            self._steering.resume()
+            self._steering.reset()
             self.log_event_info('odometry is back', 'odometry is received again: driving on')
         before = goal.pursuit
         try:
@@ -293,7 +293,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._goal = None
             self._watchdog.stop()
             self._others.stop()
-            self.log_event_info(f'goal {what}', f'goal {what}')
+            self.log_event_info(f'end {status}', f'goal {what}')
 
     # --- Stopping
 

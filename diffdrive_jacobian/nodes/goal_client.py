@@ -23,9 +23,8 @@ from diffdrive_jacobian.control import Arrival, Path
 from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.control.path import PathProgress
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import GOAL_STATUS, ODOMETRY_STATE, State, Status
-from diffdrive_jacobian.messages.conversion import MessageError, from_time
+from diffdrive_jacobian.messages.conversion import MessageError, from_time, set_pose, set_time
 from diffdrive_jacobian.messages.goal_status import GoalFollower, GoalState
 from diffdrive_jacobian.messages.names import is_named, node_of
 from diffdrive_jacobian.ros.node import THROTTLE
@@ -52,13 +51,13 @@ def goals_message(
     """
     poses = [PoseStamped() for _ in goals]
     for pose, goal in zip(poses, goals, strict=True):
-        messages.set_pose(pose.pose, goal)
+        set_pose(pose.pose, goal)
     for pose, time_ in zip(poses, times.tolist(), strict=True) if times is not None else ():
-        messages.set_time(pose.header.stamp, now + nanoseconds(time_))
+        set_time(pose.header.stamp, now + nanoseconds(time_))
     message = poses[0]
     if topic != 'goal_pose':
         message = Goals(goals=poses) if topic == 'goals' else PathMessage(poses=poses)
-    messages.set_time(message.header.stamp, now)
+    set_time(message.header.stamp, now)
     message.header.frame_id = frame
     return message
 
@@ -237,8 +236,10 @@ class GoalClient(Node):  # type: ignore[misc]
     @property
     def cancel_answer(self) -> str:
         """What the controller answered to the request to cancel; '': nothing yet."""
-        answered = self._canceling is not None and self._canceling.done()
-        return str(self._canceling.result().message) if answered else ''
+        future = self._canceling
+        if future is None or not future.done() or future.exception() is not None:
+            return ''
+        return str(future.result().message)
 
     def confirmed(self, timeout: float) -> bool:
         """Wait for a time (s) until the goals are acknowledged by all; return whether they are."""

@@ -21,6 +21,8 @@ from diffdrive_jacobian.ros.service_client import ServiceClient, is_possible
 
 PATIENCE = 5.0
 """Longest wait for an answer (s)."""
+TRIES = 50
+"""Number of commands after which nobody is looked for any more."""
 MOST = 4
 """Number of nodes that are asked."""
 
@@ -45,14 +47,15 @@ class SameWheels:
         """
         self._node, self._speeds, self._wheels, self._report = node, speeds, wheels, report
         self._clients: dict[str, ServiceClient] = {}
+        self._tries = 0
         self._asked: set[str] = set()
         self._answered: set[str] = set()
 
     def advance(self) -> bool:
         """Ask whoever is there, to be called with each command. Return whether this is done."""
-        if not self._clients:
+        if not self._clients and self._speeds.get_subscription_count():
             # The name of a node may be discovered later than its subscription.
-            self._clients = self._find() if self._speeds.get_subscription_count() else {}
+            self._clients, self._tries = self._find(), self._tries + 1
         for name, client in self._clients.items():
             if client.ready and name not in self._asked:
                 self._asked.add(name)
@@ -60,7 +63,8 @@ class SameWheels:
                 client.call(request, partial(self._on_answer, name), partial(self._on_end, name))
             client.advance()
         if not self._clients or self._answered < self._clients.keys():
-            return False
+            # A node that has no name that can be asked, as that of a command line tool.
+            return not self._clients and self._tries >= TRIES
         for client in self._clients.values():
             client.destroy()
         return True

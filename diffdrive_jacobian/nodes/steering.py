@@ -147,12 +147,8 @@ class Steering:
         return (self.controller, self.arrival.offset) != (before.controller, before.arrival.offset)
 
     def reset(self) -> None:
-        """Begin a new goal."""
+        """Let the laws forget what they remember: a new goal begins, or the robot has stood."""
         self._law.reset()
-        self._path_law.reset()
-
-    def resume(self) -> None:
-        """Go on after the robot was stopped on its way."""
         self._path_law.reset()
 
     def stopped(self, now: int) -> None:
@@ -232,7 +228,9 @@ class Steering:
         pursuit = replace(
             pursuit, follower=follower, first_step=pursuit.first_step or now, last_step=now
         )
-        return pursuit.without_path() if command is None else pursuit, command
+        if command is None:
+            return pursuit.without_path(), None
+        return pursuit, command
 
     def _braked(
         self,

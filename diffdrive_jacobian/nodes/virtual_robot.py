@@ -97,6 +97,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             kind, codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
             self.subscribe(kind, source, self._on_command, codec=codec, **commands)
         self.watch(topic_check(self, SEVERAL, 'odom'))
+        # Paths are published for other reasons, too.
         for name in ('goal_pose', 'goals'):
             self.watch(topic_check(self, GOALS_LOST, name))
         self.subscribe(
@@ -107,7 +108,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._first_clock: JumpHandle | None = None
         self._jumps = self._watch_jumps()
         self._advance()
-        self.announce(subscribed=[source], publishing=['odom', *['ground_truth'] * drifts])
+        self.announce(subscribed=[source], publishing=['odom', 'ground_truth'] if drifts else ['odom'])
 
     # --- Time
 
@@ -146,6 +147,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
                 'the robot stops at its present pose',
             )
             robot = robot.at(self._latest).restarted(now)
+            self.defects.placed(robot)
             self._publish_start(robot)
             self._publish_applied(robot)
         elif (expiry := robot.expiry) is not None and expiry <= now:

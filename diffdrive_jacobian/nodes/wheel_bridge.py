@@ -138,7 +138,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
 
     def _on_silence(self) -> None:
         if self._moving:
-            now = self.now()
+            self._last = now = self.now()
             self._follow(STANDSTILL, now, now)
             self.log_event_warning(
                 'silence',

@@ -71,7 +71,8 @@ class Parameter:
         """The limits in the descriptor; None: there are none, as where they would reject NaN."""
         if self.within is None or self.within.high == math.inf or self.nan_is_none:
             return None
-        return self.within.low if self.within.above is None else self.within.above, self.within.high
+        low = self.within.low if self.within.above is None else self.within.above
+        return low, self.within.high
 
     def converted(self, value: Any) -> Any:
         """Return a value, converted to a double if it is an integer for a double (`-p kp:=1`)."""
@@ -79,20 +80,22 @@ class Parameter:
 
     def check(self, value: Any) -> None:
         """Raise ParameterError if a value has another type or is not allowed."""
+        if must_be := self._refusal(value):
+            raise ParameterError(f"parameter '{self.name}' must be {must_be}, got {_got(value)}")
+
+    def _refusal(self, value: Any) -> str:
+        """Return what a value must be; '': it is allowed."""
         wanted = type(self.default)
         if type(value) is not wanted:
-            allowed = _TYPE_NAMES[wanted]
-        elif self.choices:
-            allowed = '' if value in self.choices else self.allowed
-        elif wanted is str:
+            return _TYPE_NAMES[wanted]
+        if self.choices:
+            return '' if value in self.choices else self.allowed
+        if wanted is str:
             fits = 0 < len(value) <= MAX_LENGTH
-            allowed = '' if fits else f'not empty and at most {MAX_LENGTH} characters'
-        elif self.within is None or (self.nan_is_none and math.isnan(value)) or value in self.within:
-            allowed = ''
-        else:
-            allowed = self.allowed
-        if allowed:
-            raise ParameterError(f"parameter '{self.name}' must be {allowed}, got {_got(value)}")
+            return '' if fits else f'not empty and at most {MAX_LENGTH} characters'
+        if self.within is None or value in self.within or (self.nan_is_none and math.isnan(value)):
+            return ''
+        return self.allowed
 
 
 def _got(value: object) -> str:
@@ -125,6 +128,8 @@ P = TypeVar('P', bound='NodeParameters')
 @dataclass(frozen=True, kw_only=True, slots=True)
 class NodeParameters:
     """Base class of the parameters of a node. Every instance is valid.
+
+    A subclass calls `NodeParameters.changed(self, ...)`: with slots `super()` does not work.
 
     Raises:
         ParameterError: A value has the wrong type or is out of range, or values contradict each other.

@@ -182,8 +182,8 @@ class GoToGoalParameters(TwistParameters):
     def declared(self) -> dict[str, Parameter]:
         """Return the parameters by their ROS names, with the gains of the controllers."""
         found = {**TwistParameters.declared(self), **self.more_gains.declared()}
-        for known in (self.controllers, self.path_controllers):
-            found[known.parameter] = replace(found[known.parameter], choices=known)
+        for registry in (self.controllers, self.path_controllers):
+            found[registry.parameter] = replace(found[registry.parameter], choices=registry)
         return found
 
     def changed(self, values: Mapping[str, Any]) -> GoToGoalParameters:
@@ -210,14 +210,14 @@ class GoToGoalParameters(TwistParameters):
 
     def _with_gains(self, values: Mapping[str, Any]) -> GoToGoalParameters:
         """Return these with the gains of the controllers that are chosen with new values."""
-        # A gain is read as an attribute.
+        # A gain is read as an attribute, so that its name must not be that of another one.
         more, used = self.more_gains, {*dir(type(self)), *OF_RCLPY}
         registries: tuple[Controllers[Any], ...] = self.controllers, self.path_controllers
-        for known in registries:
-            name = values.get(known.parameter, getattr(self, known.parameter))
-            if name in known and name not in known.built_in:
-                what = f"parameter '{known.parameter}': {name!r}"
-                more = more.with_gains_of(_found(known, name), what, GAINS, used)
+        for registry in registries:
+            name = values.get(registry.parameter, getattr(self, registry.parameter))
+            if name in registry and name not in registry.built_in:
+                what = f"parameter '{registry.parameter}': {name!r}"
+                more = more.with_gains_of(_found(registry, name), what, GAINS, used)
         return self if more == self.more_gains else replace(self, more_gains=more)
 
     def limits(self, default: float = MAX_SPEED) -> VelocityLimits:

@@ -21,7 +21,7 @@ from rclpy.qos import (
 from rclpy.subscription import Subscription
 from rclpy.waitable import NumberOfEntities, Waitable
 
-from diffdrive_jacobian.ros.qos import subscription_profile
+from diffdrive_jacobian.recording.qos import subscription_profile
 from diffdrive_jacobian.ros.rclpy_internals import (
     Polled,
     ReceivedMessage,

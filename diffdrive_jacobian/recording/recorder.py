@@ -25,13 +25,13 @@ from diffdrive_jacobian.messages.topics import OF_EVERY_NODE
 from diffdrive_jacobian.messages.topics import Selection as Selection
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
+from diffdrive_jacobian.recording.qos import to_rosbags
 from diffdrive_jacobian.recording.reception import (
     CallbackReception,
     CountingReception,
     Intake,
 )
 from diffdrive_jacobian.recording.recording import Recording, saved_on_error
-from diffdrive_jacobian.ros.qos import to_rosbags
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage, reason
 from diffdrive_jacobian.ros.runner import NodeRunner, ros_context, running

@@ -33,8 +33,8 @@ from diffdrive_jacobian.bags.bag_reader import BagError, messages, open_bag
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, message_class
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.names import base_name, namespace_of, node_of
+from diffdrive_jacobian.recording.qos import publisher_profile
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
-from diffdrive_jacobian.ros.qos import publisher_profile
 from diffdrive_jacobian.ros.rclpy_internals import RCLError, reason, restart_timer
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.signals import Signals

@@ -242,7 +242,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         if new == previous:
             return
         self.parameters = with_overrides(self, previous, new)
-        # This calls `_apply_parameters` again, with the values that they have.
+        # For each that a controller has added rclpy calls this again, with the value that it has.
         declare_new(self, previous, self.parameters)
         self.parameters_changed(previous)
 

@@ -83,7 +83,7 @@ class Watchdog:
             self._wait(self._timeout)
 
     def stop(self) -> None:
-        """Disable it until `start`."""
+        """Disable it until `start` or `change_timeout`."""
         self._timeout = 0
         self._running = False
         self._timer.cancel()
