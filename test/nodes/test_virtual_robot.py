@@ -191,6 +191,17 @@ def test_wheel_speeds_stay_when_the_wheels_change_and_are_limited_alike(lockstep
     assert list(topics.states[-1].velocity) == pytest.approx([-2.0, 5.0], rel=1e-14)
 
 
+def test_odometry_by_encoders_starts_again_where_start_pose_says(lockstep, add):
+    topics, robot = Topics(lockstep), add(VirtualRobot)
+    robot.defects.set_encoders(4)
+    lockstep.publish('cmd_vel', twist(0.3, 0.0))
+    lockstep.run_for(0.4)
+    assert pose_of(topics.odom[-1])[0] != pytest.approx(0.12)
+    lockstep.jump(-0.2)
+    lockstep.run_for(0.02)
+    assert pose_of(topics.odom[-1]) == pytest.approx(pose_of(topics.starts[-1]))
+
+
 def test_the_transform_repeats_the_odometry_where_tf2_ros_is_installed(lockstep, add, capfd):
     """Elsewhere that is logged once, and the rest works."""
     topics, installed, received = Topics(lockstep), find_spec('tf2_ros') is not None, []

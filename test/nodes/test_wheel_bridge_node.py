@@ -16,6 +16,7 @@ from support.ros_messages import WHEELS, instants, twist, twist_stamped
 from diffdrive_jacobian.drives import overrides
 from diffdrive_jacobian.faults import TimeJump
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+from diffdrive_jacobian.nodes.same_wheels import TRIES
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.parameters.wheels import WHEELS as WHEEL_PARAMETERS
@@ -228,6 +229,26 @@ def test_a_node_whose_name_leaves_no_room_for_services_is_not_asked(lockstep):
         lockstep.publish('cmd_vel', twist(0.2))
         lockstep.run_for(0.1)
     assert Liveness(lockstep.node, [f'/{name}']).silence() == 0.0
+
+
+def test_a_hidden_node_is_not_looked_for_for_ever(lockstep):
+    other = lockstep.add(Node('_ros2cli_1'))
+    other.create_subscription(JointState, 'joint_command', lambda _: None, 10)
+    bridge = lockstep.add(WheelBridge())
+    for _ in range(TRIES + 1):
+        lockstep.publish('cmd_vel', twist(0.2))
+        lockstep.run_for(0.02)
+    assert bridge._same_wheels is None
+
+
+def test_a_late_command_from_before_a_stop_is_dropped(lockstep, add, out, capfd):
+    add(WheelBridge, enable_stamped_cmd_vel=True)
+    lockstep.publish('cmd_vel', twist_stamped(0.2, 0.0, lockstep.now))
+    lockstep.run_for(0.6)
+    assert speeds(out) == [GO, STOP]
+    lockstep.publish('cmd_vel', twist_stamped(0.2, 0.0, lockstep.now - SECOND // 5))
+    assert speeds(out) == [GO, STOP]
+    assert 'older than the last command, stop' in capfd.readouterr().err
 
 
 def test_the_wheels_are_those_when_the_robot_answers(lockstep, capfd):
