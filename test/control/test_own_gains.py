@@ -12,10 +12,10 @@ import pytest
 from own_laws import Site, example
 from support import commands
 from support.lockstep_nodes import SUCCEEDED, Topics, arrives, change, make
-from support.ros_messages import goal, pose_of
+from support.ros_messages import goal, odometry, pose_of
 
 from diffdrive_jacobian import control
-from diffdrive_jacobian.control import KP, KV, OFFSET, Gain, LawError
+from diffdrive_jacobian.control import KP, KV, OFFSET, Controller, Gain, LawError
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -99,6 +99,25 @@ def test_a_change_that_declares_gains_knows_what_the_user_gave(lockstep, site, m
     )
     assert change(node, controller='polar').successful
     assert seen == [(0.7, -2.0)]
+
+
+def test_a_law_that_remembers_forgets_while_the_robot_stands(lockstep):
+    """Or the whole gap would be one step of its integral."""
+    steps = []
+
+    def law(pose, goal, *, state, dt):
+        steps.append((state[0], dt))
+        return 0.1, 0.0, [state[0] + dt]
+
+    own = Controller(name='counting', law=law, gains=(), state=(0.0,))
+    lockstep.add(GoToGoal(controller=own))
+    lockstep.publish('goal_pose', goal(5.0, 0.0))
+    for x in (0.0, 0.01):
+        lockstep.publish('odom', odometry(x, 0.0, 0.0))
+        lockstep.run_for(0.1)
+    lockstep.run_for(2.0)
+    lockstep.publish('odom', odometry(0.02, 0.0, 0.0))
+    assert steps == [(0.0, 0.0), (0.0, pytest.approx(0.1)), (0.0, 0.0)]
 
 
 def test_the_default_of_a_shared_gain_is_that_of_the_controller_chosen():
