@@ -420,9 +420,9 @@ import sys, time
 from diffdrive_jacobian.lockstep.external.process import ExternalProcess
 from diffdrive_jacobian.lockstep.external.quiet import Quiet
 process = ExternalProcess(['sh', '-c', 'echo hi; sleep 60 & sleep 60'])
-while not process.printed(0):
+while not process.printed(0) or len(found := Quiet(process.root, ()).processes()) < 3:
     time.sleep(0.001)
-print(*Quiet(process.root, ()).processes(), flush=True)
+print(*found, flush=True)
 time.sleep(60.0)
 """
 
