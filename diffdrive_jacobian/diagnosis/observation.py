@@ -36,7 +36,7 @@ from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.nodes.same_wheels import wheels_of
 from diffdrive_jacobian.parameters.wheels import WHEELS, Dimensions
 from diffdrive_jacobian.ros.runner import ros_context, running
-from diffdrive_jacobian.ros.service_client import ServiceClient, ignore
+from diffdrive_jacobian.ros.service_client import ServiceClient, ignore, is_possible
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -103,7 +103,7 @@ class Observer(Node):  # type: ignore[misc]
                 self._subscribe(topic, RECEIVED[known])
         for name in self._names()[:MAX_NODES]:
             service = f'{name}/get_parameters'
-            if name not in self._parameter_clients and '/_' not in name and _is_valid(service):
+            if name not in self._parameter_clients and '/_' not in name and is_possible(service):
                 self._parameter_clients[name] = ServiceClient(
                     self, GetParameters, service, patience=math.inf
                 )
@@ -243,7 +243,7 @@ class _Received:
 
 
 def _is_valid(name: str) -> bool:
-    """Return whether a topic or a service can have this fully qualified name."""
+    """Return whether a topic can have this fully qualified name."""
     try:
         validate_full_topic_name(name)
     except InvalidTopicNameException:
