@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from ruamel.yaml.error import YAMLError
 
 from diffdrive_jacobian.bags.corrected_reader import CorrectedReader
 from diffdrive_jacobian.bags.files import NotARegularFileError, check_regular, is_recoverable, journal_of
-from diffdrive_jacobian.bags.journal import PARAMETERS
+from diffdrive_jacobian.bags.journal import LEFT_OUT, LOST, PARAMETERS
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.numerics.checks import (
     integer,
@@ -283,6 +283,29 @@ def stored_connections(reader: Reader) -> list[Connection]:
 def custom_data(reader: Reader) -> dict[str, str]:
     """Return the custom data of an open bag."""
     return check_custom_data(reader.storage.metadata.custom)
+
+
+def lost_messages(custom: Mapping[str, str]) -> dict[str, int]:
+    """Return how many messages of each topic a recorder noted as lost in the custom data."""
+    noted = _noted(custom, LOST).items()
+    return {topic: count for topic, count in noted if isinstance(count, int) and count > 0}
+
+
+def noted_losses(custom: Mapping[str, str]) -> Iterator[str]:
+    """Describe what was lost according to the notes of a recorder in the custom data."""
+    for topic, why in sorted(_noted(custom, LEFT_OUT).items()):
+        yield f'{printable(topic)} was not recorded: {printable(why)}'
+    for topic, count in sorted(_noted(custom, LOST).items()):
+        if count:
+            yield f'{printable(count)} messages on {printable(topic)} while it was recorded'
+
+
+def _noted(custom: Mapping[str, str], key: str) -> dict[str, Any]:
+    try:
+        noted = json.loads(custom.get(key, '{}'))
+    except (ValueError, RecursionError):
+        noted = None
+    return noted if isinstance(noted, dict) else {'an unknown topic': custom[key]}
 
 
 def recorded_parameters(reader: Reader) -> dict[str, dict[str, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -12,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from diffdrive_jacobian.bags.bag_reader import find_damage
+from diffdrive_jacobian.bags.bag_reader import find_damage, noted_losses
 from diffdrive_jacobian.bags.bag_writer import Summary, build_bag
 from diffdrive_jacobian.bags.damaged_bag import DamagedBag
 from diffdrive_jacobian.bags.files import JOURNAL, is_journal, journal_of
@@ -160,7 +159,7 @@ def recover(
             damaged=damaged,
             lost=lost,
             unchecked=unchecked,
-            lost_before=_lost_before(survey.notes),
+            lost_before=tuple(noted_losses(survey.notes)),
             topics_left_out=left_out,
             undecodable=undecodable,
         )
@@ -218,30 +217,6 @@ class _Survey:
                 for topic in sorted(self._unchecked)
             ),
         )
-
-
-def _lost_before(notes: dict[str, str]) -> tuple[str, ...]:
-    """Return descriptions of the losses that a recorder has noted in the custom data."""
-    described: list[str] = []
-    for key, text in sorted(notes.items()):
-        try:
-            losses = json.loads(text)
-        except (ValueError, RecursionError):
-            losses = None
-        if not isinstance(losses, dict):
-            described.append(f'the recorder noted losses: {printable(text)}')
-        elif key == LEFT_OUT:
-            described += [
-                f'{printable(topic)} was not recorded: {printable(why)}'
-                for topic, why in sorted(losses.items())
-            ]
-        else:
-            described += [
-                f'{printable(count)} messages on {printable(topic)} while it was recorded'
-                for topic, count in sorted(losses.items())
-                if count
-            ]
-    return tuple(described)
 
 
 def _default_target(what: Path) -> Path:

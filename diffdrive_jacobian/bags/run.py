@@ -21,7 +21,10 @@ from rosbags.rosbag2 import Reader
 from diffdrive_jacobian.bags.bag_reader import (
     BagError,
     ReadingInterruptedError,
+    custom_data,
+    lost_messages,
     messages,
+    noted_losses,
     open_bag,
     recorded_parameters,
     stored_connections,
@@ -116,10 +119,13 @@ class Run:
     """Later changes: when each was recorded (ns), the node, the new values."""
     parameter_stamps: tuple[int, ...] = ()
     """The stamps of these changes (ns)."""
-    fault_events: tuple[tuple[int, str, str], ...] = ()
-    """What the faults of a lockstep world did: when it was recorded (ns), the fault, what it did."""
+    fault_events: tuple[tuple[int, FaultEvent], ...] = ()
+    """What the faults of a lockstep world did, each with when it was recorded (ns)."""
     skipped: dict[str, int] = field(default_factory=dict)
     """How many messages of a topic could not be used, by the topic's name in the bag."""
+    missing: dict[str, int] = field(default_factory=dict)
+    """How many messages of a topic the recorder or the bag counts that are not there, by the topic's
+    name in the bag."""
     notes: tuple[str, ...] = ()
     """What is wrong with the bag although it can be read, in words: messages that were skipped, and
     why, and messages that are missing."""
@@ -204,7 +210,7 @@ def read_run(
     rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = defaultdict(list)
     events: list[tuple[int, str, dict[str, Any]]] = []
     event_stamps: list[int] = []
-    fault_events: list[tuple[int, str, str]] = []
+    fault_events: list[tuple[int, FaultEvent]] = []
     with open_bag(path) as reader:
         parameters = {
             node: values
@@ -240,7 +246,7 @@ def read_run(
                         events.append((received, value.node, value.values))
                         event_stamps.append(value.stamp)
                 elif isinstance(value, FaultEvent):
-                    fault_events.append((received, value.fault, value.what))
+                    fault_events.append((received, value))
                 elif topic.table is not None:
                     rows[topic.table.series] += [
                         (received, stamp or received, row)
@@ -251,7 +257,7 @@ def read_run(
             except MessageError:
                 # The nodes drop it as well.
                 tally.refused[connection.topic] += 1
-        notes = tally.notes(connections)
+        noted = custom_data(reader)
     series, covariances = {}, {}
     for table in TABLES:
         found, count = rows[table.series], len(table.columns)
@@ -273,7 +279,8 @@ def read_run(
         parameter_stamps=tuple(event_stamps),
         fault_events=tuple(fault_events),
         skipped=dict(tally.skipped),
-        notes=notes,
+        missing=dict(tally.missing(connections) + Counter(lost_messages(noted))),
+        notes=(*tally.notes(connections), *(f'lost: {loss}' for loss in noted_losses(noted))),
         **series,
     )
 
@@ -293,6 +300,13 @@ class _Tally:
     @property
     def skipped(self) -> Counter[str]:
         return self.invalid + self.foreign + self.undecodable + self.refused
+
+    def missing(self, connections: Sequence[Connection]) -> Counter[str]:
+        """Return how many messages of each topic the bag counts that were not found."""
+        expected = Counter[str]()
+        for connection in connections:
+            expected[connection.topic] += connection.msgcount
+        return expected - self.read - self.invalid
 
     def notes(self, connections: Sequence[Connection]) -> tuple[str, ...]:
         """Return descriptions of messages that were skipped or are missing, by topic."""

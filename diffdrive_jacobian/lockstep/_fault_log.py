@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from rclpy.publisher import Publisher
@@ -40,9 +41,24 @@ class FaultEvent:
         return f'{in_seconds(self.time_ns)}: {self.fault!r} {self.what}'
 
     def message(self) -> String:
-        """Return the event as a message: a JSON object with time (s), fault and what."""
-        fields = {'time': self.time_ns / NANOSECONDS, 'fault': repr(self.fault), 'what': self.what}
-        return String(data=json.dumps(fields))
+        """Return the event as a message: a JSON object.
+
+        Time (s), fault as Python source, what it did, and the fault as data: kind and arguments.
+        """
+        given = {one.name: getattr(self.fault, one.name) for one in fields(self.fault)}
+        event = {
+            'time': self.time_ns / NANOSECONDS,
+            'fault': repr(self.fault),
+            'what': self.what,
+            'kind': type(self.fault).__name__,
+            'arguments': {name: value for name, value in given.items() if _is_data(value)},
+        }
+        return String(data=json.dumps(event))
+
+
+def _is_data(value: object) -> bool:
+    """Return whether a value is a finite number or text, as JSON has them."""
+    return isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value))
 
 
 class FaultLog:

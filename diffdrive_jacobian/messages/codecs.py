@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import attrgetter, itemgetter
+from types import MappingProxyType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from diffdrive_jacobian.messages.cdr import Reader, Writer
@@ -507,6 +508,11 @@ class FaultEvent(NamedTuple):
     fault: str
     """The fault, as Python source."""
     what: str
+    """What it did."""
+    kind: str = ''
+    """Its class; empty: not recorded."""
+    arguments: Mapping[str, Any] = MappingProxyType({})
+    """The fields of the class that are numbers or text."""
 
 
 _VALUES = (
@@ -538,11 +544,14 @@ def _fault_event(text: str) -> FaultEvent:
     try:
         fields = json.loads(text)
         fault, what = fields['fault'], fields['what']
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        kind, arguments = fields.get('kind', ''), fields.get('arguments', {})
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise MessageError('it must be a JSON object with fault and what') from error
-    if not isinstance(fault, str) or not isinstance(what, str):
-        raise MessageError('fault and what must be strings')
-    return FaultEvent(fault, what)
+    if not all(isinstance(text, str) for text in (fault, what, kind)):
+        raise MessageError('fault, what and kind must be strings')
+    if not isinstance(arguments, dict):
+        raise MessageError('arguments must be a JSON object')
+    return FaultEvent(fault, what, kind, arguments)
 
 
 PARAMETER_EVENT = Codec(

@@ -415,12 +415,12 @@ def fault_spans(one: Timeline) -> list[FaultSpan]:
     run = one.run
     begun: dict[str, float] = {}
     spans: list[FaultSpan] = []
-    times = _times(run, [event[0] for event in run.fault_events])
-    for (_, fault, what), time in zip(run.fault_events, times, strict=True):
-        if not what.startswith('ends'):
-            begun.setdefault(fault, time)
-        elif fault in begun:
-            spans.append(FaultSpan(fault, begun.pop(fault), time))
+    times = _times(run, [received for received, _ in run.fault_events])
+    for (_, event), time in zip(run.fault_events, times, strict=True):
+        if not event.what.startswith('ends'):
+            begun.setdefault(event.fault, time)
+        elif event.fault in begun:
+            spans.append(FaultSpan(event.fault, begun.pop(event.fault), time))
     last = float(one.time[-1])
     spans += [FaultSpan(fault, begin, max(begin, last)) for fault, begin in begun.items()]
     return sorted(spans, key=lambda span: span.begin)

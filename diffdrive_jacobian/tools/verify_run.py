@@ -32,11 +32,16 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
         f'{len(verification.seconds)} odometry messages, commands from {verification.source}, '
         f'starting at the first {verification.start}',
         *(f'note: {note}' for note in verification.notes),
+        *(f'missing: {one}' for one in verification.missing),
     ]
     for name, unit, values, allowed in (
         ('position', 'm', verification.distances, tolerance),
         ('heading', 'rad', verification.headings, yaw_tolerance),
+        ('v', 'm/s', verification.speeds, tolerance),
+        ('omega', 'rad/s', verification.turn_rates, yaw_tolerance),
     ):
+        if values is None:
+            continue
         worst = int(np.argmax(values))
         rms = float(np.sqrt(np.mean(values**2)))
         lines.append(
@@ -56,10 +61,16 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
     if (truth := verification.truth) is not None:
         lines.append(
             f'ground truth: maximum error {np.max(truth.distances):.3g} m, '
-            f'{np.max(truth.headings):.3g} rad in {len(truth.distances)} messages'
+            f'{np.max(truth.headings):.3g} rad, {np.max(truth.speeds):.3g} m/s, '
+            f'{np.max(truth.turn_rates):.3g} rad/s in {len(truth.distances)} messages'
         )
-    verdict = 'as recorded' if verification.holds(tolerance, yaw_tolerance) else 'NOT as recorded'
-    return '\n'.join([*lines, f'the robot moves {verdict}'])
+    if not verification.agrees(tolerance, yaw_tolerance):
+        verdict = 'the robot moves NOT as recorded'
+    elif verification.missing:
+        verdict = 'NOT verified: what was recorded agrees, but the recording is not whole'
+    else:
+        verdict = 'the robot moves as recorded'
+    return '\n'.join([*lines, verdict])
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
@@ -113,16 +124,16 @@ def _parser(program: str = PROGRAM, option: str = '') -> _cli.Parser:
     parser = _cli.Parser(
         prog=program,
         usage=' '.join([program, *option.split(), 'BAG [options]']),
-        description='Simulate a recorded run again from its commands, and compare the path with the '
-        'recorded odometry. Nothing is published, and no ROS is needed. Exit code 0: the robot moves as '
-        'recorded; 1: it does not; 2: wrong arguments, or the bag cannot be read; '
-        '130: interrupted.',
+        description='Simulate a recorded run again from its commands, and compare poses and velocities '
+        'with the recorded odometry. Nothing is published, and no ROS is needed. Exit code 0: the robot '
+        'moves as recorded; 1: it does not, or messages are missing; 2: wrong arguments, or the bag '
+        'cannot be read; 130: interrupted.',
     )
     parser.add_bag()
     default = f'{EXACT:g} if cmd_vel_out was recorded, else {BY_RECORDING_TIME:g}'
     for name, unit, of in (
-        ('--tolerance', 'M', 'position in m'),
-        ('--yaw-tolerance', 'RAD', 'heading in rad'),
+        ('--tolerance', 'M', 'position in m and of v in m/s'),
+        ('--yaw-tolerance', 'RAD', 'heading in rad and of omega in rad/s'),
     ):
         parser.add_value(name, unit, f'largest allowed difference of the {of} (default: {default})')
     parser.add_params_file(

@@ -29,6 +29,7 @@ from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.bags.verification import verify
+from diffdrive_jacobian.messages.codecs import FaultEvent
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 
 FIELDS = (
@@ -152,7 +153,7 @@ def test_events_of_faults_are_read_and_other_messages_on_their_topic_noted(tmp_p
     texts.append(json.dumps({'time': 1.0, 'fault': 'Loss()', 'what': 'begins'}))
     sent = [(11.0, '/fault_events', String(data=data)) for data in texts]
     run = read_run(write_bag(tmp_path / 'bag', sent))
-    assert run.fault_events == ((11 * SECOND, 'Loss()', 'begins'),)
+    assert run.fault_events == ((11 * SECOND, FaultEvent('Loss()', 'begins')),)
     assert '1 events of faults' in repr(run)
     assert '5 of 6 messages on /fault_events hold invalid' in run.notes[0]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import fields, replace
 from functools import cache
 from types import SimpleNamespace
@@ -19,14 +20,14 @@ from support.ros_messages import goal, goals, twist, twist_stamped
 from support.runs import built_run, series
 
 from diffdrive_jacobian.bags import BagError, read_run
+from diffdrive_jacobian.bags.recorded_robot import start_covariances
 from diffdrive_jacobian.bags.run import Series
 from diffdrive_jacobian.bags.verification import (
     COVARIANCE_TOLERANCE,
     largest_covariance_difference,
-    start_covariances,
     verify,
 )
-from diffdrive_jacobian.faults import ActuatorLag, DeadWheel, SaturatedWheel
+from diffdrive_jacobian.faults import ActuatorLag, DeadWheel, Loss, SaturatedWheel
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
@@ -180,8 +181,8 @@ def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(robot_at, d
     without = verify(replace(run, parameters={}))
     assert without.distances.max() > 0.01
     assert 'cannot be reproduced without them' in without.notes[-1]
-    late = replace(run, start_pose=rows(run.start_pose, NOTHING))
-    assert any('what it was commanded before is missing' in note for note in verify(late).notes)
+    with pytest.raises(BagError, match=r'it lacks start_pose .* does not come to a known state'):
+        verify(replace(run, start_pose=rows(run.start_pose, NOTHING)))
 
 
 def test_changes_of_the_dynamics_are_driven_again(lockstep, robot_at, tmp_path):
@@ -224,7 +225,10 @@ def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, driven, limit
     )
     run = driven([(0.3, (-1) ** number) for number in range(6)], 0.2)
     held(run, 1e-12)
-    of_another = tuple((at, f"{fault[:-1]}, robot='/b')", what) for at, fault, what in run.fault_events)
+    other = {'robot': '/b'}
+    of_another = tuple(
+        (at, event._replace(arguments={**event.arguments, **other})) for at, event in run.fault_events
+    )
     assert verify(replace(run, fault_events=of_another)).distances.max() > 0.01
     without = verify(replace(run, fault_events=()))
     assert without.distances.max() > 0.01
@@ -351,6 +355,91 @@ def test_a_bag_of_ros2_bag_record_is_verified_against_our_robot():
     assert not slower.holds(0.02, 0.02)
 
 
+@pytest.mark.parametrize('column', [3, 4])
+@pytest.mark.parametrize('factor', [1.01, 2.0, math.nan])
+def test_velocities_are_compared(run, column, factor):
+    values = run.odometry.values.copy()
+    values[50, column] *= factor
+    found = verify(replace(run, odometry=replace(run.odometry, values=values)))
+    differences = (found.speeds, found.turn_rates)[column - 3]
+    assert not found.agrees(EXACT, EXACT)
+    assert not np.delete(differences, 50).any()
+    assert found.distances.max() < EXACT
+
+
+@pytest.mark.parametrize(
+    ('name', 'index', 'words'),
+    [
+        ('odometry', 40, r'odom at 0\.800 s, when the robot published the others'),
+        ('odometry', -1, 'odom at '),
+        ('wheels', 40, 'joint_states at 0.800 s'),
+        ('start_pose', 0, 'start_pose: where the odometry began is not verified'),
+    ],
+)
+def test_a_message_that_is_missing_is_named(run, name, index, words):
+    series = getattr(run, name)
+    kept = np.delete(np.arange(len(series)), index)
+    changes = {name: rows(series, kept)}
+    if name == 'odometry':
+        changes['odometry_covariances'] = run.odometry_covariances[kept]
+    found = verify(replace(run, **changes))
+    assert found.agrees(EXACT, EXACT)
+    assert not found.holds(EXACT, EXACT)
+    (missing,) = found.missing
+    assert re.match(words, missing)
+
+
+def test_messages_that_were_skipped_or_lost_are_missing(run):
+    for changes in ({'skipped': {'/odom': 1}}, {'missing': {'/cmd_vel_out': 2}}):
+        (missing,) = verify(replace(run, **changes)).missing
+        assert re.match(r'[12] messages on /(odom|cmd_vel_out)', missing)
+    # The goals do not matter.
+    held(replace(run, skipped={'/goals': 1}))
+
+
+def test_what_a_fault_loses_is_not_missing(lockstep, robot_at, driven):
+    robot_at()
+    lockstep.inject(Loss('odom', 0.3))
+    run = driven([(0.3, 0.5)], 1.0)
+    assert len(run.odometry) < len(run.wheels) - 5
+    assert 'missing messages of odom were not looked for' in held(run).notes[-1]
+
+
+TAKES_TIME = {
+    'at once': {},
+    'ramps': {'linear__x__max_acceleration': 0.5},
+    'lag': {'wheel_lag': 0.1},
+    'ramps, delay': {'linear__x__max_acceleration': 0.5, 'command_delay': 0.053},
+    'all': {'linear__x__max_acceleration': 5.0, 'command_delay': 0.053, 'wheel_lag': 0.002},
+}
+
+
+@pytest.mark.parametrize('name', TAKES_TIME)
+@pytest.mark.parametrize(('odometry', 'commands'), [(0.0, 0.5), (0.4, 0.4), (0.31, 0.7)])
+def test_a_late_recorder_does_not_blame_the_robot(robot_at, driven, name, odometry, commands):
+    robot_at(**TAKES_TIME[name])
+    run = driven([(0.1, 0.5), (0.3, -0.5), (0.0, 0.4), (-0.2, 0.1), (0.2, 0.0)], 0.23, rest=0.3)
+    begun = run.odometry.received[0]
+
+    def late(series, seconds):
+        return rows(series, series.received >= begun + seconds * 1e9)
+
+    # The latched start arrives after the odometry.
+    received = np.maximum(run.start_pose.received, begun + int(odometry * 1e9) + 10**8)
+    found = held(
+        replace(
+            run,
+            odometry=late(run.odometry, odometry),
+            odometry_covariances=np.empty((0, 9)),
+            wheels=late(run.wheels, odometry),
+            cmd_vel_out=late(run.cmd_vel_out, commands),
+            start_pose=replace(run.start_pose, received=received),
+        )
+    )
+    assert len(found.distances) > 10
+    assert found.start == 'odometry'
+
+
 def still(count=100, begin=10**9, step=10**8, **keywords):
     """Return the odometry of a robot that stands."""
     return series('odometry', begin + step * np.arange(count), np.zeros((count, 5)), **keywords)
@@ -390,6 +479,7 @@ def test_odometry_that_was_not_compared_is_counted():
     verification = verify(built_run(odometry=odometry, cmd_vel=commands))
     assert len(verification.seconds) == 61
     assert verification.notes == (
+        'the velocities were not compared: when each command took effect is in cmd_vel_out',
         '39 of 100 odometry messages precede the start of the simulated robot and were not compared',
     )
 
@@ -428,10 +518,12 @@ def test_the_covariances_are_those_of_the_node_to_the_last_bit(lockstep, robot_a
     assert not verification.holds(EXACT, EXACT)
 
 
-@pytest.mark.parametrize('missing', ['parameters', 'start_pose'])
-def test_without_the_robot_or_its_start_the_covariances_are_not_compared(run, missing):
-    without = {} if missing == 'parameters' else rows(run.start_pose, NOTHING)
-    assert held(replace(run, **{missing: without})).covariance_difference is None
+def test_without_the_robot_or_its_start_the_covariances_are_not_compared(run):
+    assert held(replace(run, parameters={})).covariance_difference is None
+    without_start = replace(run, start_pose=rows(run.start_pose, NOTHING))
+    assert verify(without_start).covariance_difference is None
+    # Any other robot has none.
+    held(replace(without_start, parameters={}))
 
 
 def test_covariances_are_compared_in_units_of_their_standard_deviations():

@@ -1,0 +1,141 @@
+"""The robot of a recorded run: its model, how that changed, and where its odometry started."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.bags.run import Run
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
+from diffdrive_jacobian.messages.codecs import FaultEvent
+from diffdrive_jacobian.messages.names import base_name
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.parameters.virtual_robot import MULTIPLIERS, VirtualRobotParameters
+from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
+from diffdrive_jacobian.simulation.robot import RobotModel
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+ROBOT = 'virtual_robot'
+"""Base name of the node."""
+MARGIN = 1 * NANOSECONDS
+"""Messages that belong together are recorded within this time of one another (ns)."""
+_NOISE_PARAMETERS = ('wheel_separation', 'wheel_travel_variance')
+_MOTOR_FAULTS: dict[str, Callable[[Actuators, Mapping[str, Any]], Actuators]] = {
+    'ActuatorLag': lambda actuators, fault: actuators.lagging(fault['seconds']),
+    'DeadWheel': lambda actuators, fault: actuators.weakened(fault['wheel'], 0.0),
+    'SaturatedWheel': lambda actuators, fault: actuators.weakened(fault['wheel'], fault['max_velocity']),
+}
+"""What the faults that change how a robot follows commands do to its actuators."""
+_NEVER = int(np.iinfo(np.int64).max)
+
+
+def recorded_model(run: Run) -> RobotModel | None:
+    """Return the model of the robot; None: it was not recorded, or it changed."""
+    recorded = run.of_node(ROBOT)
+    # A robot that starts later than the recorder reports its first values as changes.
+    changed = {
+        name
+        for _, node, values in run.parameter_events
+        if base_name(node) == ROBOT
+        for name, value in values.items()
+        if value != recorded.get(name)
+    }
+    separation, variance = (run.number_of_node(ROBOT, name, math.nan) for name in _NOISE_PARAMETERS)
+    separation *= run.number_of_node(ROBOT, 'wheel_separation_multiplier', 1.0)
+    if changed & {*_NOISE_PARAMETERS, *MULTIPLIERS} or not (separation > 0.0 and variance >= 0.0):
+        return None
+    try:
+        drift = VirtualRobotParameters().changed(recorded).drift()
+    except ParameterError:
+        drift = None
+    return RobotModel(wheel_separation=separation, wheel_travel_variance=variance, drift=drift)
+
+
+def recorded_dynamics(run: Run) -> list[RobotModel]:
+    """Return models that follow commands as the recorded robot did, without limits of the velocity.
+
+    Returns:
+        The model at the start, and that from each message of `cmd_vel_out` on. []: the robot follows
+        commands at once, or its parameters were not recorded.
+    """
+    changes = _changes_by_command(run)
+    parameters, faults = dict(run.of_node(ROBOT)), list[FaultEvent]()
+    model = _dynamics(parameters, faults)
+    found = [model]
+    for number in range(len(run.cmd_vel_out)):
+        for change in changes.get(number, ()):
+            if isinstance(change, dict):
+                parameters.update(change)
+            elif change.what == 'begins':
+                faults.append(change)
+            elif change.what.startswith('ends'):
+                faults = [fault for fault in faults if fault.fault != change.fault]
+        if number in changes:
+            model = _dynamics(parameters, faults)
+        found.append(model)
+    return found if any(model.takes_time for model in found) else []
+
+
+def _changes_by_command(run: Run) -> dict[int, list[dict[str, Any] | FaultEvent]]:
+    """Return parameters and faults that changed, by the message of `cmd_vel_out` from which they count.
+
+    The robot publishes its command again after each change.
+    """
+    received, stamps = run.cmd_vel_out.received.tolist(), run.cmd_vel_out.stamps
+    changes: dict[int, list[dict[str, Any] | FaultEvent]] = defaultdict(list)
+    times = run.parameter_stamps
+    if len(times) != len(run.parameter_events):
+        times = tuple(recorded for recorded, *_ in run.parameter_events)
+    for (recorded, node, values), stamp in zip(run.parameter_events, times, strict=True):
+        if base_name(node) != ROBOT:
+            continue
+        first = bisect_left(received, recorded - MARGIN)
+        last = bisect_right(received, recorded + MARGIN)
+        later = first + np.flatnonzero(stamps[first:last] >= stamp)
+        # Of several changes at one time each has a message of its own.
+        earliest = stamps[later] == np.min(stamps[later], initial=_NEVER)
+        together = later[earliest].tolist() or [last]
+        free = [index for index in together if index not in changes]
+        changes[int((free or together)[0 if free else -1])].append(values)
+    for recorded, event in run.fault_events:
+        if event.kind in _MOTOR_FAULTS and base_name(event.arguments.get('robot') or ROBOT) == ROBOT:
+            # As above. Where one fault ends and another begins, the robot is without both in between.
+            index = bisect_left(received, recorded)
+            while index in changes and received[index + 1 : index + 2] == [recorded]:
+                index += 1
+            changes[index].append(event)
+    return changes
+
+
+def _dynamics(parameters: Mapping[str, Any], faults: Iterable[FaultEvent]) -> RobotModel:
+    """Return a model from the parameters of a robot and the faults of its motors."""
+    try:
+        model = VirtualRobotParameters().changed(parameters).model()
+        actuators = model.actuators
+        for fault in faults:
+            actuators = _MOTOR_FAULTS[fault.kind](actuators, fault.arguments)
+    except (ParameterError, ValueError, LookupError):
+        return RobotModel()
+    return replace(model, limits=VelocityLimits(), command_timeout=0, actuators=actuators)
+
+
+def start_covariances(run: Run) -> NDArray[np.float64]:
+    """Return the covariance in each `start_pose`, by rows, shape (n, 9); zero where it is invalid."""
+    entries = run.start_covariances
+    if len(entries) != len(run.start_pose):
+        return np.zeros((len(run.start_pose), 9))
+    matrices: NDArray[np.float64] = entries[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].copy()
+    for row in matrices:
+        try:
+            covariance_of_pose('covariance', row.reshape(3, 3))
+        except ValueError:
+            row[:] = 0.0
+    return matrices
