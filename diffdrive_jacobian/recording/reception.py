@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import islice
 from math import inf
+from types import MappingProxyType
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
@@ -28,9 +30,13 @@ from diffdrive_jacobian.ros.rclpy_internals import (
     lost_messages,
     waiting_messages,
 )
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_RUNS = 100
 """Runs of consecutive numbers that are kept of each publisher, to recognize messages received twice."""
+MAX_WAIT = NANOSECONDS // 10
+"""Longest time for which a message waits in the buffer of a socket (ns). One that was received later
+after it was sent has been sent again."""
 BURST = 1000
 """Largest number of messages that are taken from a queue at once."""
 
@@ -126,6 +132,7 @@ class CallbackReception:
     missed = 0
     doubtful = False
     confirmed: frozenset[bytes] = frozenset()
+    last: Mapping[bytes, int] = MappingProxyType({})
 
     def __init__(
         self, node: Node, kind: type, topic: str, depth: int, callback: Callable[[bytes], None]
@@ -255,6 +262,8 @@ class CountingReception:
         self._reliable_from: dict[bytes, float] = {}
         self.confirmed: set[bytes] = set()
         """Reliable publishers (GID) that have delivered all that they sent before the end."""
+        self.last: dict[bytes, int] = {}
+        """Of each reliable publisher, when it had sent, or sent again, what was received last (ns)."""
 
     @property
     def missed(self) -> int:
@@ -294,6 +303,9 @@ class CountingReception:
     def _receive_reliable(self, message: ReceivedMessage) -> None:
         if message.number is not None:
             self._reliable_from.setdefault(message.publisher, message.number)
+        # A clock of another machine may be ahead.
+        received = message.received or time.time_ns()
+        self.last[message.publisher] = max(min(message.sent, received), received - MAX_WAIT)
         if self._is_late(message):
             # A reliable publisher delivers in order.
             self.confirmed.add(message.publisher)

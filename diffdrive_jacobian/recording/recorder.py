@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
-from rclpy.qos import ReliabilityPolicy
 from rosbags.interfaces import Qos
 
 from diffdrive_jacobian.bags.bag_writer import Summary
@@ -24,6 +23,7 @@ from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.messages.topics import OF_EVERY_NODE
 from diffdrive_jacobian.messages.topics import Selection as Selection
 from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.recording.overflow import Overflow
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 from diffdrive_jacobian.recording.qos import to_rosbags
 from diffdrive_jacobian.recording.reception import (
@@ -32,11 +32,13 @@ from diffdrive_jacobian.recording.reception import (
     Intake,
 )
 from diffdrive_jacobian.recording.recording import Recording, saved_on_error
+from diffdrive_jacobian.ros.fastdds_profiles import receives_through_udp
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage, reason
 from diffdrive_jacobian.ros.runner import NodeRunner, ros_context, running
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 NAME = 'record_run'
 """Name of the node."""
@@ -47,20 +49,14 @@ DRAIN_PATIENCE = 12.0
 IN_TRANSIT = 0.1
 """After this time without such a message no more is expected, unless there was a burst (s)."""
 HEARTBEAT = 3.5
-"""Time after a burst in which reliable publishers send what was lost in it (s).
+"""Time after an overflow in which reliable publishers send what was lost in it (s).
 
 Fast DDS: by default a publisher that sends nothing else says every 3 s which messages it has sent.
 """
-BURST_VOLUME = 80_000
-"""Volume with which the buffer of a socket may have overflowed (bytes; Linux: 212,992 by default)."""
-BURST_TIME = 0.05
-"""Time within which such a volume is a burst (s)."""
-LARGE = 200_000
-"""Size of messages that exceed such a buffer (bytes): several heartbeats may be needed to repair one."""
+ACTIVE = 1.0
+"""A publisher may have sent something within this time after its last message that was received (s)."""
 HELD = 0.5
 """Time between two calls of `drained` after which the process was held, and nothing was received (s)."""
-OVERHEAD = 768
-"""What a message takes up in the buffer of a socket besides its data (bytes)."""
 MAX_REPORT = 500
 """Largest length of the report on a topic (characters)."""
 DISCOVERY_PERIOD = 0.2
@@ -98,6 +94,7 @@ class Recorder(Node):  # type: ignore[misc]
             ParameterError: The name of a topic is invalid.
         """
         super().__init__(NAME, start_parameter_services=False, **kwargs)
+        self._overflow = Overflow(counted=receives_through_udp())
         self._sink = sink
         self._everything = selection.everything
         self._names = {self._resolved(topic) for topic in selection.topics}
@@ -110,12 +107,9 @@ class Recorder(Node):  # type: ignore[misc]
         self._clock_now = now or (lambda: int(self.get_clock().now().nanoseconds))
         self._stamped = with_info and not self.get_parameter('use_sim_time').value
         self._end: int | None = None
-        self._drain_deadline = self._last_added = self._checked = self._called = 0.0
-        self._window, self._volume, self._last_burst = 0.0, 0, -inf
-        # Publishers of large messages, and when the last one was received.
-        self._large: dict[bytes, float] = {}
+        self._drain_deadline = self._last_added = self._called = 0.0
         self.awaited: list[str] = []
-        """After `end`: topics with reliable publishers that have not confirmed that all is received."""
+        """After `end`: topics of which reliable publishers may send again what was lost."""
         self.messages = 0
         """Number of messages received."""
 
@@ -131,6 +125,7 @@ class Recorder(Node):  # type: ignore[misc]
 
     def discover(self) -> None:
         """Subscribe to new topics, and query parameters of new nodes; to be called often."""
+        self._overflow.look()
         for topic, _ in self.get_topic_names_and_types():
             if not self._wants(topic) or topic in self._refused:
                 continue
@@ -160,36 +155,32 @@ class Recorder(Node):  # type: ignore[misc]
         Requires `with_info`.
         """
         self._end = time.time_ns()
-        self._last_added = self._checked = self._called = time.monotonic()
+        self._last_added = self._called = time.monotonic()
         self._drain_deadline = self._last_added + DRAIN_PATIENCE
-        large = {one for one, at in self._large.items() if self._last_added - at < HEARTBEAT}
-        self._large = dict.fromkeys(large, 0.0)
-        self.awaited = self._unconfirmed()
+        self.awaited = self._awaited()
 
     def drained(self) -> bool:
         """Return whether all messages sent before `end` were received, or the time for them is over.
 
         A reliable publisher has delivered all if a message arrives that it sent after the end. Otherwise
-        a message may be missing after a burst, which may have exceeded the buffer: the publisher then
-        sends it again within `HEARTBEAT`.
+        its last messages may be missing if a buffer overflowed then. It sends them again within
+        `HEARTBEAT`, unless it has ended: then the end of the topic is reported.
         """
         assert self._intake is not None, 'requires with_info'
+        self._overflow.look()
         self._intake.take_all()
         self._report_missed()
         now = time.monotonic()
         if now - self._called > HELD:
-            self._last_added = self._last_burst = now
+            self._last_added = now
             self._drain_deadline = now + DRAIN_PATIENCE
         self._called = now
-        if now - self._checked > IN_TRANSIT:
-            self._checked = now
-            self.awaited = self._unconfirmed()
-        in_doubt = self.awaited and now - self._last_burst < HEARTBEAT
-        if now - self._last_added > IN_TRANSIT and not in_doubt:
-            for topic in self._unconfirmed(self._large):
-                why = 'its last messages are large, and cannot be confirmed'
-                self._sink.set_left_out(f'possibly the end of {topic}', why)
-            return True
+        if now - self._last_added > IN_TRANSIT:
+            self.awaited = self._awaited()
+            if not self.awaited:
+                for topic in self._in_doubt():
+                    self._leave_out_end(topic, 'a buffer overflowed, and then its publisher was silent')
+                return True
         if now > self._drain_deadline:
             self.give_up(f'messages were still arriving {DRAIN_PATIENCE:.0f} s after the end')
             return True
@@ -197,20 +188,34 @@ class Recorder(Node):  # type: ignore[misc]
 
     def give_up(self, why: str) -> None:
         """Report that messages sent before `end` may be missing, because it was not waited for them."""
-        for topic in self._unconfirmed() or self.topics:
-            self._sink.set_left_out(f'possibly the end of {topic}', why)
+        for topic in self._in_doubt() or self.topics:
+            self._leave_out_end(topic, why)
 
-    def _unconfirmed(self, among: Collection[bytes] | None = None) -> list[str]:
-        """Return the topics with a reliable publisher, among these or all, of which more may come."""
+    def _leave_out_end(self, topic: str, why: str) -> None:
+        self._sink.set_left_out(f'possibly the end of {topic}', why)
+
+    def _in_doubt(self) -> dict[str, set[bytes]]:
+        """Return the reliable publishers of which the last messages may have been dropped, by topic."""
+        doubtful = {
+            topic: {
+                publisher
+                for publisher, last in reception.last.items()
+                if publisher not in reception.confirmed
+                and self._overflow.within(last, last + int(ACTIVE * NANOSECONDS))
+            }
+            for topic, reception in self._receptions.items()
+        }
+        return {topic: publishers for topic, publishers in doubtful.items() if publishers}
+
+    def _awaited(self) -> list[str]:
+        """Return the topics of which dropped messages may still be sent again."""
+        if time.time_ns() - self._overflow.last > HEARTBEAT * NANOSECONDS:
+            return []
         return [
             topic
-            for topic, channel in self._channels.items()
+            for topic, publishers in self._in_doubt().items()
             if any(
-                one.topic_type == channel.type_name
-                and one.qos_profile.reliability == ReliabilityPolicy.RELIABLE
-                and bytes(one.endpoint_gid) not in self._receptions[topic].confirmed
-                and (among is None or bytes(one.endpoint_gid) in among)
-                for one in self.get_publishers_info_by_topic(topic)
+                bytes(one.endpoint_gid) in publishers for one in self.get_publishers_info_by_topic(topic)
             )
         ]
 
@@ -290,22 +295,19 @@ class Recorder(Node):  # type: ignore[misc]
             if (mismatch := f'{channel.topic} of {other}') not in self._refused:
                 self._leave_out(mismatch, f'{channel.topic} is recorded as {channel.type_name}')
 
+    def destroy_node(self) -> None:
+        """Let go of the sockets, too."""
+        self._overflow.close()
+        super().destroy_node()
+
     # --- Messages
 
     def _on_data(self, channel: int, data: bytes) -> None:
         self._add(channel, self._now(), data)
 
     def _on_message(self, channel: int, message: ReceivedMessage) -> None:
-        self._last_added = now = time.monotonic()
-        if now - self._window > BURST_TIME:
-            self._window, self._volume = now, 0
-        self._volume += len(message.data) + OVERHEAD
-        # What was repaired at the end may have been too much for the buffer again.
-        repaired = self._end is not None and now - self._last_burst < HEARTBEAT
-        if repaired or self._volume > BURST_VOLUME:
-            self._last_burst = now
-        if len(message.data) > LARGE:
-            self._large[message.publisher] = now
+        self._last_added = time.monotonic()
+        self._overflow.received(len(message.data), message.received)
         self._add(channel, message.received if self._stamped else self._now(), message.data)
 
     def _is_late(self, message: ReceivedMessage) -> bool:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -473,7 +472,7 @@ def replay(
     playback, signals, progress = playback or Playback(), signals or Signals(), progress or _Silent()
     with (
         open_bag(bag) as reader,
-        nullcontext() if acknowledgement_timeout is None else fast_heartbeats(),
+        fast_heartbeats(),
         ros_context([NODE, *ros_arguments]) as context,
         running(context, isolated=False) as runner,
     ):

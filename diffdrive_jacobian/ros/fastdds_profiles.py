@@ -45,6 +45,8 @@ _CHOICES = (
 TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
 """Environment variable of Fast DDS that names its transports."""
 _WITH_UDP = ('', 'DEFAULT', 'UDPv4')
+_used: set[str] = set()
+"""The profiles with which the first participant of this process was created."""
 _DEFAULTS = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
 
 
@@ -86,8 +88,14 @@ def for_other_process() -> dict[str, str]:
 
 def withdraw() -> None:
     """Remove the variable when the first participant exists: other processes must not inherit it."""
-    if _own():
+    if profiles := _own():
+        _used.update(profiles)
         del os.environ[VARIABLE]
+
+
+def receives_through_udp() -> bool:
+    """Return whether this process receives all messages through UDP, once it has a node."""
+    return 'announcements' in _used | (_own() or set())
 
 
 def _use(profile: str) -> bool:

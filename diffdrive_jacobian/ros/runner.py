@@ -17,6 +17,7 @@ from typing import ClassVar, TypeVar
 
 import rclpy
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger_level, set_logger_level
@@ -43,6 +44,9 @@ MAX_DOMAIN_ID = 232
 """Largest domain id. The ports of larger ones do not exist."""
 CHECK_PERIOD = 0.1
 """Longest time between two checks of the condition of the loop (s)."""
+PATIENCE = 1.0
+"""Longest wait for acknowledgements at the end (s)."""
+_A_MOMENT = Duration(seconds=0.01)
 RULES = {'-p': 'NAME:=VALUE', '--param': 'NAME:=VALUE', '-r': 'OLD:=NEW', '--remap': 'OLD:=NEW'}
 """Form of the rule after each flag."""
 DISCOVERY = (
@@ -292,14 +296,22 @@ class Runner(NodeRunner):
         self._executor.spin_once(timeout_sec=CHECK_PERIOD)
 
     def close(self) -> None:
-        """Stop the nodes while they can still publish, then destroy them."""
+        """Stop the nodes while they can still publish, let that be received, then destroy them."""
         if self.context.ok():
             for node in self._nodes:
                 if isinstance(node, ParameterizedNode):
                     node.stop('shutting down')
+            self._wait_for_acknowledgements()
         self._executor.shutdown()
         for node in self._nodes:
             node.destroy_node()
+
+    def _wait_for_acknowledgements(self) -> None:
+        """Wait until reliable subscriptions have what was published, but no longer than `PATIENCE`."""
+        deadline = time.monotonic() + PATIENCE
+        waiting = [one for node in self._nodes for one in node.publishers]
+        while waiting and time.monotonic() < deadline:
+            waiting = [one for one in waiting if not one.wait_for_all_acked(_A_MOMENT)]
 
 
 def make_executor(

@@ -154,4 +154,4 @@ def test_entry_points_announce_themselves():
     ended = subprocess.run(
         [sys.executable, '-c', PRINTING], capture_output=True, text=True, timeout=60, check=True
     )
-    assert ended.stdout == 'announcements.xml\n'
+    assert ended.stdout == 'announcements_heartbeats.xml\n'

@@ -1,0 +1,119 @@
+"""When the buffers through which this process receives may have overflowed.
+
+Through UDP, as the programs of this package receive, the kernel counts for each socket the datagrams
+that it dropped because the buffer was full (SO_MEMINFO, Linux). Fast DDS sends them again, unless the
+publisher ends first. Through shared memory, which a user's profile of Fast DDS may choose, nothing
+counts them: there the volume of what came at once has to do.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import struct
+import sys
+import time
+from array import array
+from bisect import bisect_left
+from contextlib import suppress
+
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+_SO_MEMINFO = 55
+_MEMINFO = struct.Struct('9I')
+"""Nine counters, the last of which is that of drops (linux/sock_diag.h)."""
+_SPACING = NANOSECONDS // 1000
+"""Least time between every second entry in the history (ns)."""
+BURST_VOLUME = 80_000
+"""Volume with which a buffer may have overflowed that nobody counts (bytes; a socket has 212,992)."""
+BURST_TIME = NANOSECONDS // 20
+"""Time within which such a volume is a burst (ns)."""
+OVERHEAD = 768
+"""What a message takes up in a buffer besides its data (bytes)."""
+
+
+class Overflow:
+    """The times at which datagrams were dropped, by the clock of this machine (ns since the epoch)."""
+
+    def __init__(self, *, counted: bool) -> None:
+        """Find the sockets of this process.
+
+        Args:
+            counted: Whether all that is received comes through UDP, so that the kernel counts.
+        """
+        self._sockets = _user_sockets() if counted else []
+        self._dropped = self._count()
+        self._window = self._volume = 0
+        self._times = array('q')
+
+    @property
+    def last(self) -> int:
+        """The latest of these times; 0: nothing was dropped."""
+        return self._times[-1] if self._times else 0
+
+    def within(self, begin: int, end: int) -> bool:
+        """Return whether datagrams may have been dropped between two times (ns)."""
+        first = bisect_left(self._times, begin)
+        return first < len(self._times) and self._times[first] <= end
+
+    def close(self) -> None:
+        """Let go of the sockets."""
+        while self._sockets:
+            self._sockets.pop().close()
+        self._dropped = 0
+
+    def look(self) -> None:
+        """Note whether datagrams were dropped since the last call."""
+        dropped = self._count()
+        if dropped != self._dropped:
+            self._dropped = dropped
+            self._note(time.time_ns())
+
+    def received(self, size: int, stamp: int) -> None:
+        """Take account of a message of a size (bytes) that was received at a time (ns)."""
+        if self._sockets:
+            self.look()
+            return
+        if not 0 <= stamp - self._window <= BURST_TIME:
+            self._window, self._volume = stamp, 0
+        self._volume += size + OVERHEAD
+        if self._volume > BURST_VOLUME:
+            self._note(stamp)
+
+    def _note(self, stamp: int) -> None:
+        times = self._times
+        if len(times) > 1 and stamp - times[-2] < _SPACING:
+            times[-1] = stamp
+        else:
+            times.append(stamp)
+
+    def _count(self) -> int:
+        counters = (
+            one.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size) for one in self._sockets
+        )
+        return sum(_MEMINFO.unpack(one)[-1] for one in counters)
+
+
+def _user_sockets() -> list[socket.socket]:
+    """Return the UDP sockets of this process that receive messages; []: that is not known.
+
+    RTPS (9.6.1) gives messages odd ports, and discovery even ones.
+    """
+    found: list[socket.socket] = []
+    if not sys.platform.startswith('linux'):
+        return found
+    for name in os.listdir('/proc/self/fd'):
+        # One may be closed meanwhile, as that of the directory is.
+        with suppress(OSError):
+            if not stat.S_ISSOCK(os.fstat(int(name)).st_mode):
+                continue
+            one = socket.socket(fileno=os.dup(int(name)))
+            if one.type == socket.SOCK_DGRAM and one.family == socket.AF_INET:
+                port = one.getsockname()[1]
+                if port % 2:
+                    one.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+                    found.append(one)
+                    continue
+            one.close()
+    return found

@@ -1,0 +1,71 @@
+"""Overflow of the buffers of sockets: as the kernel counts it, or by the volume of what came at once."""
+
+from __future__ import annotations
+
+import socket
+import sys
+
+import pytest
+
+from diffdrive_jacobian.recording import overflow
+from diffdrive_jacobian.recording.overflow import Overflow
+
+MILLISECOND = 10**6
+
+
+@pytest.fixture
+def receiver():
+    """A socket as RTPS has them for messages, with an odd port."""
+    for port in range(40_001, 60_000, 2):
+        one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            one.bind(('127.0.0.1', port))
+        except OSError:
+            one.close()
+            continue
+        with one:
+            yield one
+        return
+
+
+def flood(receiver, count=2000):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for _ in range(count):
+            sender.sendto(bytes(500), receiver.getsockname())
+
+
+@pytest.mark.skipif(not sys.platform.startswith('linux'), reason='only Linux counts them')
+def test_the_kernel_counts_what_it_drops(receiver):
+    watched = Overflow(counted=True)
+    flood(receiver, 10)
+    watched.look()
+    assert watched.last == 0
+    begun = overflow.time.time_ns()
+    flood(receiver)
+    watched.received(10**9, begun)
+    assert watched.within(begun, begun + 10**10)
+    assert not watched.within(watched.last + 1, watched.last + 10**10)
+    assert not watched.within(begun - 10**10, begun)
+    watched.close()
+    watched.look()
+    assert watched.last < overflow.time.time_ns()
+
+
+def test_where_nobody_counts_a_burst_is_an_overflow(receiver):
+    watched = Overflow(counted=False)
+    flood(receiver)
+    watched.look()
+    size = overflow.BURST_VOLUME // 4
+    for number in range(8):
+        watched.received(size, 20 * MILLISECOND * number)
+    assert watched.last == 0
+    for number in range(4):
+        watched.received(size, 1000 * MILLISECOND + number)
+    assert watched.last == 1000 * MILLISECOND + 3
+
+
+def test_the_history_is_bounded_in_its_rate():
+    watched = Overflow(counted=False)
+    for number in range(1000):
+        watched.received(2 * overflow.BURST_VOLUME, number * MILLISECOND // 100)
+    assert len(watched._times) <= 21
