@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bag_reader import (
@@ -208,9 +207,10 @@ def read_run(
     """
     path = Path(path)
     rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = defaultdict(list)
-    events: list[tuple[int, str, dict[str, Any]]] = []
-    event_stamps: list[int] = []
+    events: list[tuple[int, Changes]] = []
     fault_events: list[tuple[int, FaultEvent]] = []
+    read, invalid = Counter[str](), Counter[str]()
+    skipped = Counter[tuple[str, str]]()
     with open_bag(path) as reader:
         parameters = {
             node: values
@@ -220,31 +220,29 @@ def read_run(
         names = _wheel_names(parameters)
         chosen = _choose(reader, dict(topics or {}), namespace)
         connections = [one for one in reader.connections if one.id in chosen]
-        tally = _Tally()
         stored = stored_connections(reader)
         foreign = {
             one.id
             for one in connections
             if recorded_definition_differs(one.msgtype, type_hashes(one, stored))
         }
-        readers = {
+        decode = {
             one.id: chosen[one.id].codec(one.msgtype).reader(known_structure(one.msgtype))
             for one in connections
         }
-        for connection, received, data in messages(reader, connections, tally.invalid):
+        for connection, received, data in messages(reader, connections, invalid):
             if interrupted():
                 raise ReadingInterruptedError
-            topic = chosen[connection.id]
-            tally.read[connection.topic] += 1
+            topic, name = chosen[connection.id], connection.topic
+            read[name] += 1
             if connection.id in foreign:
-                tally.foreign[connection.topic] += 1
+                skipped[name, f'were recorded with another definition of {connection.msgtype}'] += 1
                 continue
             try:
-                value = readers[connection.id](data)
+                value = decode[connection.id](data)
                 if isinstance(value, Changes):
                     if namespace in (None, namespace_of(value.node)):
-                        events.append((received, value.node, value.values))
-                        event_stamps.append(value.stamp)
+                        events.append((received, value))
                 elif isinstance(value, FaultEvent):
                     fault_events.append((received, value))
                 elif topic.table is not None:
@@ -253,11 +251,17 @@ def read_run(
                         for stamp, row in topic.table.rows(value, names)
                     ]
             except DecodingError:
-                tally.undecodable[connection.topic] += 1
+                skipped[name, 'cannot be decoded as little-endian CDR'] += 1
             except MessageError:
                 # The nodes drop it as well.
-                tally.refused[connection.topic] += 1
+                skipped[name, 'hold invalid or implausible values'] += 1
         noted = custom_data(reader)
+    for name, count in invalid.items():
+        skipped[name, 'cannot be decoded'] += count
+    expected = Counter[str]()
+    for connection in connections:
+        expected[connection.topic] += connection.msgcount
+    read += invalid
     series, covariances = {}, {}
     for table in TABLES:
         found, count = rows[table.series], len(table.columns)
@@ -275,64 +279,37 @@ def read_run(
         odometry_covariances=covariances['odometry'],
         start_covariances=covariances['start_pose'],
         parameters=parameters,
-        parameter_events=tuple(events),
-        parameter_stamps=tuple(event_stamps),
+        parameter_events=tuple((received, one.node, one.values) for received, one in events),
+        parameter_stamps=tuple(one.stamp for _, one in events),
         fault_events=tuple(fault_events),
-        skipped=dict(tally.skipped),
-        missing=dict(tally.missing(connections) + Counter(lost_messages(noted))),
-        notes=(*tally.notes(connections), *(f'lost: {loss}' for loss in noted_losses(noted))),
+        skipped=dict(_by_topic(skipped)),
+        missing=dict(expected - read + Counter(lost_messages(noted))),
+        notes=(*_notes(skipped, read, expected), *(f'lost: {one}' for one in noted_losses(noted))),
         **series,
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Tally:
-    """Counts of messages by the name of their topic in the bag."""
+def _by_topic(skipped: Counter[tuple[str, str]]) -> Counter[str]:
+    """Return how many messages of each topic were skipped, of counts by topic and reason."""
+    found = Counter[str]()
+    for (topic, _), count in skipped.items():
+        found[topic] += count
+    return found
 
-    read: Counter[str] = field(default_factory=Counter)
-    invalid: Counter[str] = field(default_factory=Counter)
-    """Messages without a valid time or bytes, which `messages` leaves out; they are not in `read`."""
-    foreign: Counter[str] = field(default_factory=Counter)
-    """Messages of a type that was recorded with another definition than the known one."""
-    undecodable: Counter[str] = field(default_factory=Counter)
-    refused: Counter[str] = field(default_factory=Counter)
 
-    @property
-    def skipped(self) -> Counter[str]:
-        return self.invalid + self.foreign + self.undecodable + self.refused
-
-    def missing(self, connections: Sequence[Connection]) -> Counter[str]:
-        """Return how many messages of each topic the bag counts that were not found."""
-        expected = Counter[str]()
-        for connection in connections:
-            expected[connection.topic] += connection.msgcount
-        return expected - self.read - self.invalid
-
-    def notes(self, connections: Sequence[Connection]) -> tuple[str, ...]:
-        """Return descriptions of messages that were skipped or are missing, by topic."""
-        found = self.read + self.invalid
-        expected: Counter[str] = Counter()
-        types: dict[str, str] = {}
-        for connection in connections:
-            expected[connection.topic] += connection.msgcount
-            types[connection.topic] = connection.msgtype
-        lines = []
-        for topic in sorted(expected):
-            for count, why in (
-                (self.foreign[topic], f'were recorded with another definition of {types[topic]}'),
-                (self.invalid[topic], 'cannot be decoded'),
-                (self.undecodable[topic], 'cannot be decoded as little-endian CDR'),
-                (self.refused[topic], 'hold invalid or implausible values'),
-            ):
-                if count:
-                    of = f'{count} of {found[topic]} messages on {printable(topic)}'
-                    lines.append(f'{of} {why} and were skipped')
-            if found[topic] != expected[topic]:
-                lines.append(
-                    f'{found[topic]} messages on {printable(topic)} were found, '
-                    f'the bag should have {expected[topic]}'
-                )
-        return tuple(lines)
+def _notes(
+    skipped: Counter[tuple[str, str]], read: Counter[str], expected: Counter[str]
+) -> Iterator[str]:
+    """Describe messages that were skipped, or that the bag counts and that were not found, by topic."""
+    for topic in sorted(expected):
+        for (name, why), count in sorted(skipped.items()):
+            if name == topic:
+                yield f'{count} of {read[topic]} messages on {printable(topic)} {why} and were skipped'
+        if read[topic] != expected[topic]:
+            yield (
+                f'{read[topic]} messages on {printable(topic)} were found, '
+                f'the bag should have {expected[topic]}'
+            )
 
 
 def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dict[int, Topic]:

@@ -9,7 +9,7 @@ import json
 import math
 import shutil
 import sqlite3
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 
 import numpy as np
@@ -19,8 +19,8 @@ from support.bags import SECOND, odom, start, write_bag
 from support.raw_bags import PLUGINS, channel, data_file, run_tool, write_records
 from support.ros_messages import goal, joint_command, twist_stamped
 
-from diffdrive_jacobian.bags import BagError, NothingToSaveError, read_run, recover
-from diffdrive_jacobian.bags.bag_reader import MetadataError, check_metadata, find_damage
+from diffdrive_jacobian.bags import BagError, DamagedBagError, NothingToSaveError, read_run, recover
+from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import PARAMETERS, Message, Text
 from diffdrive_jacobian.bags.message_definitions import definition
@@ -103,32 +103,35 @@ INVALID_TOPIC = {
 TOPIC = (TOPICS, 0, 'topic_metadata')
 
 
-def test_an_invalid_value_is_named(whole, tmp_path):
-    changes = [(key, (key, value)) for key, values in INVALID.items() for value in values]
-    changes += [(key, (*TOPIC, key, value)) for key, values in INVALID_TOPIC.items() for value in values]
-    changes += [
-        ('topic_metadata', (*TOPIC, ABSENT)),
-        ('message_count', (TOPICS, 0, 'message_count', -3)),
-    ]
-    for key, change in changes:
-        shutil.copy(whole['mcap'] / 'metadata.yaml', tmp_path)
-        edit(tmp_path, *change)
-        with pytest.raises(MetadataError) as caught:
-            check_metadata(tmp_path / 'metadata.yaml')
-        assert 'metadata.yaml' in str(caught.value), change
-        assert key in str(caught.value), change
+HARMLESS = {'version', 'duration', 'message_count', 'compression_format', 'files', 'ros_distro'}
+"""Some values of these are read."""
 
 
-@pytest.mark.parametrize(('key', 'value'), [('version', 'nine'), ('name', '/x'), ('type', 'a/msg/B')])
+def test_an_invalid_value_is_an_error_or_changes_nothing(whole, tmp_path):
+    changes = [(key, value) for key, values in INVALID.items() for value in values]
+    changes += [(*TOPIC, key, value) for key, values in INVALID_TOPIC.items() for value in values]
+    changes += [(*TOPIC, ABSENT), (TOPICS, 0, 'message_count', -3)]
+    read = set()
+    for number, change in enumerate(changes):
+        bag = shutil.copytree(whole['mcap'], tmp_path / str(number))
+        edit(bag, *change)
+        with suppress(DamagedBagError):
+            assert len(read_run(bag).odometry) == COUNT, change
+            read.add(change[-2])
+    assert read <= HARMLESS | {'type_description_hash'}
+
+
+@pytest.mark.parametrize(
+    ('key', 'value'), [('storage_identifier', 'nine'), ('name', '/x'), ('type', 'a/msg/B')]
+)
 def test_all_tools_agree_on_a_damaged_bag(bag, tmp_path, capsys, key, value):
-    if key == 'version':
+    if key == 'storage_identifier':
         edit(bag, key, value)
     else:
         # Only the data file shows that it is wrong.
         edit(bag, TOPICS, topic_index(bag), 'topic_metadata', key, value)
-        check_metadata(bag / 'metadata.yaml')
     bag = bag.rename(tmp_path / 'a bag')
-    named = 'version' if key == 'version' else '/odom'
+    named = 'nine' if value == 'nine' else '/odom'
     for tool in (plot_run, replay_run):
         code, out, err = run_tool(tool.main, capsys, bag)
         assert (code, out) == (2, '')
@@ -228,7 +231,7 @@ def test_metadata_that_is_no_map_or_too_deep_is_damage(whole, tmp_path):
     bag = shutil.copytree(whole['mcap'], tmp_path / 'bag')
     for text in NO_MAPS:
         (bag / 'metadata.yaml').write_text(text)
-        with pytest.raises(BagError, match=r'metadata\.yaml'):
+        with pytest.raises(BagError, match=r'metadata|YAML'):
             read_run(bag)
         recovery = recover(bag, replace=True)
         assert len(read_run(recovery.bag).odometry) == COUNT
