@@ -11,7 +11,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,9 @@ from diffdrive_jacobian.messages.names import base_name, namespace_of
 from diffdrive_jacobian.messages.topics import READABLE, TABLES, Topic
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.bags.timeline import Timeline
 
 MAX_NUMBER = 1e6
 """Largest magnitude of the numeric parameters of our nodes (m, m/s, rad/s)."""
@@ -139,6 +142,18 @@ class Run:
         lines += [f'  {len(self.fault_events)} events of faults'] * bool(self.fault_events)
         lines += [f'  {note}' for note in self.notes]
         return '\n'.join([*lines, ')'])
+
+    def timeline(self) -> Timeline:
+        """Return goals, paths and errors at each odometry message, as `bags.timeline.timeline`."""
+        from diffdrive_jacobian.bags.timeline import timeline
+
+        return timeline(self)
+
+    def table(self) -> dict[str, NDArray[np.float64]]:
+        """Return columns by name, one value for each odometry message, as `bags.table.table`."""
+        from diffdrive_jacobian.bags.table import table
+
+        return table(self)
 
     def lacking(self, what: str) -> BagError:
         """Return the error that something was not found in the run, with the notes that may tell why."""

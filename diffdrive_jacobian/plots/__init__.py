@@ -1,8 +1,8 @@
-"""Pictures of the five documents, each drawn by one function; figures and tables of runs and sweeps.
+"""Pictures of the five documents, each drawn by one function; figures of runs and sweeps.
 
 `geometry()` returns a matplotlib figure, which `plot_jacobian geometry` writes to a file. `run_figure`
-draws runs, `run_table` writes a run as CSV, `sweep_figure` draws sweeps. Neither ROS nor a display is
-needed. matplotlib is imported when something is drawn: without it that raises ModuleNotFoundError.
+draws runs, `sweep_figure` draws sweeps. Neither ROS nor a display is needed. matplotlib is imported when
+something is drawn: without it that raises ModuleNotFoundError.
 """
 
 from __future__ import annotations
@@ -42,7 +42,6 @@ __all__ = [
     'parking',
     'path_laws',
     'run_figure',
-    'run_table',
     'spring',
     'sweep_figure',
     'velocity_ellipses',
@@ -81,5 +80,5 @@ PICTURES = {name: what for name, (_, what) in _PICTURES.items()}
 """What each picture shows."""
 if not TYPE_CHECKING:
     _FUNCTIONS = {name: f'plots.{module}' for name, (module, _) in _PICTURES.items()}
-    _MODULES = {name: f'plots.{name}' for name in ('run_figure', 'run_table', 'sweep_figure')}
+    _MODULES = {name: f'plots.{name}' for name in ('run_figure', 'sweep_figure')}
     __getattr__, __dir__ = lazy.attach(__name__, _FUNCTIONS | _MODULES)

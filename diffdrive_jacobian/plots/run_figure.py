@@ -13,20 +13,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from diffdrive_jacobian.bags.run import Run, Series
-from diffdrive_jacobian.bags.timeline import (
-    Array,
-    Timeline,
-    commanded,
-    jumps,
-    limits,
-    line,
-    measured,
-    seconds,
-    timeline,
-    tolerance,
-)
+from diffdrive_jacobian.bags.timeline import Array, Timeline, jumps, seconds, timeline, tolerance
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension
 from diffdrive_jacobian.plots.rendering import render, styled
+from diffdrive_jacobian.plots.run_lines import commanded, limits, line, measured
 from diffdrive_jacobian.plots.uncertainty import distance_travelled, draw_uncertainty, uncertainty_marks
 from diffdrive_jacobian.text import printable
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.bags.run import Run, read_run
+from diffdrive_jacobian.bags.table import DECIMALS, csv_text
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.topics import READABLE
-from diffdrive_jacobian.plots.output_files import FORMATS, check_directory, new_file
+from diffdrive_jacobian.plots.output_files import FORMATS, check_directory, create, new_file
 from diffdrive_jacobian.plots.run_figure import draw, names
-from diffdrive_jacobian.plots.run_table import DECIMALS, write_csv
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli, _output
@@ -91,7 +91,7 @@ def _write(
 
 def _write_table(run: Run, path: Path, *, replace: bool) -> None:
     path.parent.mkdir(exist_ok=True)
-    write_csv(run, path, replace=replace)
+    create(path, csv_text(run).encode(), replace=replace)
 
 
 def _picture(options: argparse.Namespace, bags: Sequence[Path]) -> Path:

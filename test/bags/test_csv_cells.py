@@ -11,7 +11,7 @@ from support.bags import SECOND, write_bag
 from support.ros_messages import goal, joint_command, odometry
 
 from diffdrive_jacobian.bags.run import read_run
-from diffdrive_jacobian.plots.run_table import write_csv
+from diffdrive_jacobian.bags.table import csv_text
 
 NUMBER = re.compile(r'(-?\d+(\.\d+)?(e-?\d+)?)?')
 HEADER = re.compile(r'[a-z][A-Za-z0-9_]*')
@@ -34,7 +34,7 @@ def test_names_of_joints_and_frames_are_not_in_the_table_of_a_run(tmp_path):
     robot = {'left_wheel_name': joints[0], 'right_wheel_name': joints[1], 'x': start}
     run = read_run(write_bag(tmp_path / 'bag', sent, parameters={'/virtual_robot': robot}))
     assert len(run.wheels) == 3
-    write_csv(run, tmp_path / 'run.csv')
+    (tmp_path / 'run.csv').write_text(csv_text(run))
     header, *rows = csv.reader(io.StringIO((tmp_path / 'run.csv').read_text()))
     assert len(rows) == 3
     assert [cell for cell in header if not HEADER.fullmatch(cell)] == []

@@ -43,10 +43,11 @@ from diffdrive_jacobian.bags.files import MCAP_MAGIC
 from diffdrive_jacobian.bags.journal import Message, Text
 from diffdrive_jacobian.bags.recovery import Recovery, UncheckedError
 from diffdrive_jacobian.bags.run import Run
-from diffdrive_jacobian.bags.timeline import commanded, limits, measured, timeline
+from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.plots.run_figure import LABELS
+from diffdrive_jacobian.plots.run_lines import commanded, limits, measured
 
 pytestmark = pytest.mark.usefixtures('quick_disk', 'bounded_memory')
 

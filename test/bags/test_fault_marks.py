@@ -12,9 +12,10 @@ from support.bags import write_bag
 from support.runs import sample
 
 from diffdrive_jacobian.bags.run import read_run
-from diffdrive_jacobian.bags.timeline import commanded, measured, timeline
+from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.faults import Push, TimeJump
 from diffdrive_jacobian.plots.run_figure import NAMED, fault_spans, figure
+from diffdrive_jacobian.plots.run_lines import commanded, measured
 from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
 

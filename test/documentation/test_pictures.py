@@ -110,7 +110,7 @@ def test_the_columns_of_the_wheel_cancel_at_the_ground_and_the_feet_stand_on_it(
 
 
 def test_every_picture_is_public_and_in_the_documentation(folder, capsys):
-    assert {*plots.PICTURES, 'PICTURES', 'run_figure', 'run_table', 'sweep_figure'} == {*plots.__all__}
+    assert {*plots.PICTURES, 'PICTURES', 'run_figure', 'sweep_figure'} == {*plots.__all__}
     table = (ROOT / 'doc' / 'documents.md').read_text().split('| name | shows |', 1)[1].split('\n\n')[0]
     assert dict(re.findall(r'^\| `(\w+)` \| (.*) \|$', table, re.MULTILINE)) == plots.PICTURES
     assert run('--help') == 0

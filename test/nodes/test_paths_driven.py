@@ -16,6 +16,7 @@ from support.ros_messages import goal, odometry, path, receive, time_of
 from support.runs import STRAIGHT, run_of
 
 from diffdrive_jacobian.bags.run import read_run
+from diffdrive_jacobian.bags.table import csv_text
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.control import Path, circle_path, line_path, planned_path
 from diffdrive_jacobian.drives import drive, in_lockstep
@@ -25,7 +26,6 @@ from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.plots.run_figure import figure
-from diffdrive_jacobian.plots.run_table import write_csv
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.drive_to import main
@@ -60,7 +60,7 @@ def test_how_late_a_robot_is_that_is_too_slow_for_a_trajectory_is_said_everywher
     assert np.diff(one.late[on_path]).min() > -1e-9
     # It drives as fast as it can while the times wait.
     assert one.run.odometry.values[10:100, 3] == pytest.approx(np.full(90, 0.2))
-    write_csv(one.run, tmp_path / 'run.csv')
+    (tmp_path / 'run.csv').write_text(csv_text(one.run))
     with open(tmp_path / 'run.csv') as file:
         *_, row = (row for row in csv.DictReader(file) if row['late_s'])
     assert float(row['late_s']) == pytest.approx(outcome.late, abs=0.05)
@@ -114,7 +114,7 @@ def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
     # Until the robot has arrived.
     assert one.path[-1] == -1
     assert one.progress[one.path >= 0][-1] == pytest.approx(planned.length, abs=0.021)
-    write_csv(one.run, tmp_path / 'run.csv')
+    (tmp_path / 'run.csv').write_text(csv_text(one.run))
     with open(tmp_path / 'run.csv') as file:
         *_, row = (row for row in csv.DictReader(file) if row['path_progress_m'])
     assert float(row['path_progress_m']) == pytest.approx(planned.length, abs=0.021)

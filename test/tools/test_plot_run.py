@@ -16,11 +16,11 @@ from support.ros_messages import goal, joint_command, twist, twist_stamped
 from support.runs import RATE, sample
 
 from diffdrive_jacobian.bags import BagError, read_run
+from diffdrive_jacobian.bags.table import COLUMNS, decimal_seconds
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.plots.output_files import create
 from diffdrive_jacobian.plots.run_figure import LABELS, draw, figure, names
-from diffdrive_jacobian.plots.run_table import COLUMNS, decimal_seconds
 
 plot = partial(commands.run, 'plot_run')
 refused = partial(commands.refused, 'plot_run')
@@ -196,9 +196,10 @@ def test_messages_that_were_skipped_are_reported_in_picture_and_terminal(run, tm
 def test_csv_holds_the_numbers_of_the_run(bag, run, folder):
     assert plot(bag, '-o', 'a.png', '--csv', 'a.csv').code == 0
     columns, one = read_csv('a.csv'), timeline(run)
-    assert columns.dtype.names == COLUMNS
+    assert columns.dtype.names == tuple(COLUMNS)
+    assert run.table().keys() == COLUMNS.keys()
     assert columns['time_s'].tolist() == one.time.tolist()
-    expected = dict(zip(COLUMNS[1:6], run.odometry.values.T, strict=True))
+    expected = dict(zip([*COLUMNS][1:6], run.odometry.values.T, strict=True))
     expected |= {'distance_m': one.distance, 'bearing_error_rad': one.bearing_error}
     expected |= {'omega_right_radps': run.wheels.values[:, 0]}
     expected |= {'omega_left_radps': run.wheels.values[:, 1]}

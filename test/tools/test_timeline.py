@@ -11,7 +11,8 @@ from support.ros_messages import goal, goals, twist
 from support.runs import RATE, STRAIGHT, drive
 
 from diffdrive_jacobian.bags import read_run
-from diffdrive_jacobian.bags.timeline import BUCKETS, limits, line, seconds, timeline
+from diffdrive_jacobian.bags.timeline import seconds, timeline
+from diffdrive_jacobian.plots.run_lines import BUCKETS, limits, line
 
 CONTROLLER = {'controller': 'go_to_goal', 'use_goal_heading': False, 'xy_goal_tolerance': 0.05}
 TOPICS = {

@@ -1,36 +1,46 @@
-"""A recorded run as a table with one row for each odometry message, and as a CSV file."""
+"""A recorded run as a table with one row for each odometry message, and as CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from pathlib import Path
+from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.run import Run, Series
-from diffdrive_jacobian.bags.timeline import Timeline, seconds, timeline
-from diffdrive_jacobian.plots.output_files import create
+from diffdrive_jacobian.bags.timeline import Array, Timeline, seconds, timeline
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-__all__ = ['COLUMNS', 'table', 'write_csv']
-
-COLUMNS = (
-    *('time_s', 'x_m', 'y_m', 'theta_rad', 'v_mps', 'omega_radps'),
-    *('distance_m', 'bearing_error_rad', 'v_command_mps', 'omega_command_radps'),
-    *('omega_right_radps', 'omega_left_radps', 'goal_heading_error_rad', 'beyond_goal_m'),
-    *('path_progress_m', 'along_path_m', 'across_path_m', 'path_heading_error_rad'),
-    'late_s',
-)
-"""Columns of the table, with their units."""
 DECIMALS = 9
 """Decimal places of the values in a CSV file. Its times are exact to the nanosecond."""
+COLUMNS: Mapping[str, Callable[[Timeline], Array]] = {
+    'time_s': lambda one: one.time,
+    'x_m': lambda one: one.run.odometry.values[:, 0],
+    'y_m': lambda one: one.run.odometry.values[:, 1],
+    'theta_rad': lambda one: one.run.odometry.values[:, 2],
+    'v_mps': lambda one: one.run.odometry.values[:, 3],
+    'omega_radps': lambda one: one.run.odometry.values[:, 4],
+    'distance_m': lambda one: one.distance,
+    'bearing_error_rad': lambda one: one.bearing_error,
+    'v_command_mps': lambda one: _command(one)[:, 0],
+    'omega_command_radps': lambda one: _command(one)[:, 1],
+    'omega_right_radps': lambda one: _interpolated(one, one.run.wheels)[:, 0],
+    'omega_left_radps': lambda one: _interpolated(one, one.run.wheels)[:, 1],
+    'goal_heading_error_rad': lambda one: one.goal_heading_error,
+    'beyond_goal_m': lambda one: _beyond_goal(one),
+    'path_progress_m': lambda one: one.progress,
+    'along_path_m': lambda one: one.along,
+    'across_path_m': lambda one: one.across,
+    'path_heading_error_rad': lambda one: one.path_heading_error,
+    'late_s': lambda one: one.late,
+}
+"""The columns with their units, and how each is computed, shape (n,)."""
 
 
-def table(run: Run) -> NDArray[np.float64]:
-    """Return a run as an array, one row for each odometry message and one column for each of `COLUMNS`.
+def table(run: Run) -> dict[str, Array]:
+    """Return the `COLUMNS` of a run by name, each with one value for each odometry message.
 
     Time counts from the first odometry message. The command is the latest one at that time: as applied
     (`cmd_vel_out`), or as sent (`cmd_vel`) if that was not recorded. Wheel speeds are interpolated
@@ -42,23 +52,16 @@ def table(run: Run) -> NDArray[np.float64]:
         BagError: There is no odometry.
     """
     one = timeline(run)
-    commands = run.cmd_vel_out if len(run.cmd_vel_out) else run.cmd_vel
-    return np.column_stack(
-        [
-            one.time,
-            run.odometry.values,
-            one.distance,
-            one.bearing_error,
-            _latest(one, commands),
-            _interpolated(one, run.wheels),
-            one.goal_heading_error,
-            _beyond_goal(one),
-            *(one.progress, one.along, one.across, one.path_heading_error, one.late),
-        ]
-    )
+    return {name: column(one) for name, column in COLUMNS.items()}
 
 
-def _beyond_goal(one: Timeline) -> NDArray[np.float64]:
+def _command(one: Timeline) -> Array:
+    """Return the latest command at each odometry message, shape (n, 2)."""
+    run = one.run
+    return _latest(one, run.cmd_vel_out if len(run.cmd_vel_out) else run.cmd_vel)
+
+
+def _beyond_goal(one: Timeline) -> Array:
     """Return how far the axle centre is beyond its goal at each odometry message, shape (n,) (m)."""
     places, found = one.run.odometry.values[:, :2], np.full(len(one.time), np.nan)
     for goal in np.unique(one.goal[one.goal >= 0]):
@@ -69,14 +72,14 @@ def _beyond_goal(one: Timeline) -> NDArray[np.float64]:
     return found
 
 
-def _latest(one: Timeline, series: Series) -> NDArray[np.float64]:
+def _latest(one: Timeline, series: Series) -> Array:
     """Return the latest values at each odometry message, NaN before the first one, shape (n, k)."""
     at, known = _clocks(one, series)
     last = np.searchsorted(known, at, side='right')
     return np.vstack([np.full((1, series.values.shape[1]), np.nan), series.values])[last]
 
 
-def _interpolated(one: Timeline, series: Series) -> NDArray[np.float64]:
+def _interpolated(one: Timeline, series: Series) -> Array:
     """Return the value at each odometry message, NaN outside of the recorded times, shape (n, 2)."""
     at, known = _clocks(one, series)
     if not len(series):
@@ -85,7 +88,7 @@ def _interpolated(one: Timeline, series: Series) -> NDArray[np.float64]:
     return np.column_stack(columns)
 
 
-def _clocks(one: Timeline, series: Series) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _clocks(one: Timeline, series: Series) -> tuple[Array, Array]:
     """Return times of the odometry and of a series that can be compared and do not decrease (s)."""
     times = one.time, seconds(one.run, series)
     if all((np.diff(time) >= 0.0).all() for time in times):
@@ -108,20 +111,19 @@ def _decimal(value: float) -> str:
     return '0' if text == '-0' else text
 
 
-def write_csv(run: Run, path: Path, *, replace: bool = False) -> None:
-    """Write a run to a new CSV file with a header line; the fields of unknown values are empty.
+def csv_text(run: Run) -> str:
+    """Return a run as CSV, with a header line; the fields of unknown values are empty.
 
-    Times are exact, values are rounded to `DECIMALS` places. `replace`: as for `draw`.
+    Times are exact, values are rounded to `DECIMALS` places.
 
     Raises:
         BagError: The run has no odometry.
-        FileExistsError: The file exists.
-        OSError: The file cannot be written.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(COLUMNS)
     stamps = (run.odometry.stamps - run.odometry.stamps[0]).tolist()
-    for stamp, (_, *values) in zip(stamps, table(run).tolist(), strict=True):
+    rows = np.column_stack([*table(run).values()]).tolist()
+    for stamp, (_, *values) in zip(stamps, rows, strict=True):
         writer.writerow([decimal_seconds(stamp), *map(_decimal, values)])
-    create(path, text.getvalue().encode(), replace=replace)
+    return text.getvalue()
