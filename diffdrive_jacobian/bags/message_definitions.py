@@ -179,6 +179,45 @@ def definition(name: str) -> Definition:
         ) from error
 
 
+def definition_and_hash(type_name: str, text: str, type_hash: str) -> tuple[str, str]:
+    """Return the definition of a type, and its hash, given what a bag has of them; '': nothing.
+
+    Raises:
+        UnknownTypeError: The bag lacks one of them, and the type is not known.
+    """
+    known = None
+    try:
+        known = _installed_or_known(type_name)
+        reason = f'{type_name} is installed in another version than it was recorded'
+    except UnknownTypeError as error:
+        reason = str(error)
+    # Where the hashes are the same, the text in the file may be damaged, or differ in comments.
+    if known is not None and (
+        type_hash == known.type_hash or (not type_hash and text in ('', known.text))
+    ):
+        return known.text, known.type_hash
+    if text and type_hash:
+        return text, type_hash
+    if not text:
+        raise UnknownTypeError(reason)
+    try:
+        # rosbags' `register` would generate code from it and execute that.
+        store = get_typestore(Stores.EMPTY)
+        store.fielddefs.update(get_types_from_msg(text, type_name))
+        return text, store.hash_rihs01(type_name)
+    except (TypesysError, LookupError, ValueError, AssertionError, RecursionError) as error:
+        raise UnknownTypeError(reason) from error
+
+
+def _installed_or_known(type_name: str) -> Definition:
+    try:
+        return definition(type_name)
+    except UnknownTypeError:
+        if is_known(type_name):
+            return known_definition(type_name)
+        raise
+
+
 @cache
 def message_class(name: str) -> Any:
     """Return the Python class of a message type (`package/msg/Name`).

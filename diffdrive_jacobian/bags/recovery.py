@@ -128,12 +128,12 @@ def recover(
                 yield record
 
         survey = _Survey(records())
-        lost, unchecked, left_out = tuple(old.losses), tuple(old.unchecked), bool(old.left_out)
+        lost, unchecked = tuple(old.found.losses), tuple(old.found.unchecked)
         undecodable = survey.undecodable
         # A journal is no bag, whole as it may be.
         damaged = '' if is_journal(what) else find_damage(what)
         count = survey.kinds[Message]
-        whole = old.message_count == count or (what.suffix == '.mcap' and what.is_file())
+        whole = old.metadata.message_count == count or (what.suffix == '.mcap' and what.is_file())
         if whole and not lost and not damaged and not is_journal(what):
             if unchecked:
                 found = f'nothing was found missing in {what}, but it cannot be called complete:'
@@ -160,7 +160,7 @@ def recover(
             lost=lost,
             unchecked=unchecked,
             lost_before=tuple(noted_losses(survey.notes)),
-            topics_left_out=left_out,
+            topics_left_out=bool(old.found.left_out),
             undecodable=undecodable,
         )
 

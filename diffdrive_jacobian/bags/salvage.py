@@ -77,6 +77,10 @@ _RECORDS: dict[int, Any] = {
 """The records that are read besides messages."""
 
 
+_IN_JOURNAL = {Opcode.ATTACHMENT, Opcode.DATA_END}
+"""The records of a journal after its header and outside of its chunks."""
+
+
 class _Fields(ReadDataStream):
     """The fields of a record. One that ends behind the record is an error; the library cuts it off."""
 
@@ -87,145 +91,74 @@ class _Fields(ReadDataStream):
         return data
 
 
-class _McapFile:
-    """Reads an MCAP file, and compares what is found with the checksums and counts in it."""
+class _Claims:
+    """What an MCAP file says of itself, and what was found in it: where they differ, that is lost."""
 
-    def __init__(self, file: BinaryIO, note: Note, doubt: Note) -> None:
-        self._file = file
-        self._note, self._doubt = note, doubt
-        self._schemas: dict[int, Schema] = {}
-        self._found: Counter[int] = Counter()
-        self._counts: dict[int, int] | None = None
+    def __init__(self) -> None:
+        self.found: Counter[int] = Counter()
+        """Messages by channel."""
         self._topics: dict[int, Topic] = {}
-        self._unchecked = False
-        self._behind = self._differing = 0
-        self._numbered, self._last = False, 0
-        self._in_data, self._data_is_right = True, False
+        self._counts: dict[int, int] | None = None
         # Only the last of each kind counts, so that each part of the file is read once.
         self._checksums: dict[str, tuple[int, int, int]] = {}
+        self._is_journal = False
+        self._last_number = self._behind = self._redescribed = 0
+        self._in_data, self._unchecked = True, False
 
-    def read(self) -> Iterator[Found]:
-        size = self._file.seek(0, 2)
-        self._file.seek(0)
-        if self._file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
-            self._note(f'its {size} bytes are not the start of an MCAP file')
-            return
-        good, opcode = len(MCAP_MAGIC), 0
-        # Where a record is invalid, the position of the next one is unknown.
-        with suppress(*_INVALID):
-            for opcode, payload, end in _walk(self._file, size):
-                if opcode == Opcode.CHUNK:
-                    yield from self._chunk(payload, end > size)
-                elif end <= size:
-                    record = _parsed(opcode, payload)
-                    yield from self._record(record, checked=False)
-                    self._check(record, opcode, payload, end)
-                if end <= size:
-                    good = end
-        self._file.seek(good)
-        if good == size and opcode != Opcode.FOOTER:
-            self._doubt('it has no end: what its writer had not written yet is not in it')
-        elif opcode != Opcode.FOOTER or self._file.read(len(MCAP_MAGIC) + 1) != MCAP_MAGIC:
-            lost = f'the last {size - good} of its {size} bytes are not a complete record'
-            self._note(f'it is cut off: {lost}')
-        self._finish()
-
-    def _chunk(self, payload: bytes, cut: bool) -> Iterator[Found]:
-        try:
-            # The library reads what there is of a chunk that is cut off.
-            chunk = Chunk.read(ReadDataStream(BytesIO(payload)))
-            data = unpack(chunk.compression, chunk.data, chunk.uncompressed_size)
-        except (*UNPACK_ERRORS, *_INVALID) as error:
-            why = str(error) or 'it is too short'
-            self._note(f'a chunk of {len(payload)} bytes cannot be unpacked: {why}')
-            return
-        size, checksum = chunk.uncompressed_size, chunk.uncompressed_crc
-        right = len(data) == size and checksum in (0, zlib.crc32(data))
-        if not cut and not right:
-            seconds = (chunk.message_end_time - chunk.message_start_time) / NANOSECONDS
-            what = f'a chunk of {size} bytes ({seconds:.1f} s)'
-            self._note(f'{what} is damaged: its messages may be altered')
-        good = 0
-        with suppress(*_INVALID):
-            for opcode, record, ending in _walk(BytesIO(data), len(data)):
-                if ending <= len(data):
-                    yield from self._record(_parsed(opcode, record), checked=checksum != 0)
-                    good = ending
-        if good < len(data) and not cut:
-            lost = f'the last {len(data) - good} of the {size} bytes of a chunk'
-            self._note(f'{lost} are not complete records')
-
-    def _record(self, record: McapRecord | None, *, checked: bool) -> Iterator[Found]:
-        """Yield what is in a complete record; `checked`: it is in a chunk with a checksum."""
-        if isinstance(record, McapMessage):
-            self._found[record.channel_id] += 1
-            self._behind += not self._in_data
-            self._last = max(self._last, record.sequence)
-            self._unchecked |= self._in_data and not checked
-            yield Message(record.channel_id, record.log_time, record.data, record.sequence)
-        elif isinstance(record, Schema):
-            self._schemas[record.id] = record
-        elif isinstance(record, McapChannel):
-            schema = self._schemas.get(record.schema_id)
-            topic = Topic(
-                record.id,
-                record.topic,
-                schema.name if schema else '',
-                record.message_encoding,
-                record.metadata.get('offered_qos_profiles', ''),
-                record.metadata.get('topic_type_hash', ''),
-                schema.data.decode() if schema else '',
-            )
-            self._differing += self._topics.setdefault(record.id, topic) != topic
-            self._unchecked |= self._in_data and not checked
-            yield topic
-        elif isinstance(record, Attachment):
-            if record.media_type == CUSTOM_DATA:
-                yield Text(record.name, record.data.decode())
-        elif isinstance(record, Metadata) and record.name == 'rosbag2':
-            yield record.metadata.get('serialized_metadata', '')
-
-    def _check(self, record: McapRecord | None, opcode: int, payload: bytes, end: int) -> None:
-        """Take the counts and checksums from a record of the file."""
-        start = end - len(payload) - _HEAD.size
-        if self._numbered and self._in_data and opcode not in (Opcode.ATTACHMENT, Opcode.DATA_END):
-            self._note(f'a record has the opcode {opcode}, which is none of a journal')
+    def take(self, record: McapRecord | None, start: int, end: int) -> None:
+        """Take the counts and checksums from a record between two places of the file."""
         if isinstance(record, Statistics):
             self._counts = record.channel_message_counts
         elif isinstance(record, Header):
-            self._numbered |= record.library == LIBRARY
-        elif opcode == Opcode.ATTACHMENT:
-            if payload[-4:] not in (bytes(4), _checksum(payload[:-4])):
-                self._note(f'an attachment of {len(payload)} bytes is damaged: it is left out')
+            self._is_journal |= record.library == LIBRARY
         elif isinstance(record, DataEnd):
             self._in_data = False
             self._checksums['data section'] = 0, start, record.data_section_crc
         elif isinstance(record, Footer):
             self._checksums['summary'] = record.summary_start or start, end - 4, record.summary_crc
 
-    def _finish(self) -> None:
-        """Report what differs, and what cannot be checked."""
+    def may_have(self, opcode: int) -> bool:
+        """Return whether such a record may be outside of chunks: a journal has few kinds."""
+        return not self._is_journal or not self._in_data or opcode in _IN_JOURNAL
+
+    def met_message(self, message: McapMessage, *, checked: bool) -> None:
+        """Count a message. `checked`: it is in a chunk with a checksum."""
+        self.found[message.channel_id] += 1
+        self._behind += not self._in_data
+        self._last_number = max(self._last_number, message.sequence)
+        self._unchecked |= self._in_data and not checked
+
+    def met_topic(self, topic: Topic, *, checked: bool) -> None:
+        """Compare a description of a topic with the first one of the same number."""
+        self._redescribed += self._topics.setdefault(topic.id, topic) != topic
+        self._unchecked |= self._in_data and not checked
+
+    def compare(self, file: BinaryIO, note: Note, doubt: Note) -> None:
+        """Say what differs, and what cannot be checked, when all of the file was read."""
+        data_is_right = False
         for what, (start, end, checksum) in self._checksums.items():
-            right = checksum != 0 and file_checksum(self._file, start, end) == checksum
+            right = checksum != 0 and file_checksum(file, start, end) == checksum
             if checksum and not right:
-                self._note(f'the checksum of its {what} is wrong')
-            self._data_is_right |= right and what == 'data section'
-        if self._differing:
-            self._note(f'{self._differing} descriptions of topics differ from earlier ones')
+                note(f'the checksum of its {what} is wrong')
+            data_is_right |= right and what == 'data section'
+        if self._redescribed:
+            note(f'{self._redescribed} descriptions of topics differ from earlier ones')
         if self._behind:
-            self._note(f'{self._behind} of its messages are behind its data section')
-        found, counts = self._found, self._counts
-        if self._numbered and self._last != found.total():
-            self._note(f'its messages have the numbers 1 to {self._last}, {found.total()} were found')
+            note(f'{self._behind} of its messages are behind its data section')
+        found, counts, last = self.found, self._counts, self._last_number
+        if self._is_journal and last != found.total():
+            note(f'its messages have the numbers 1 to {last}, {found.total()} were found')
         if counts is not None and any(counts.get(one, 0) != found[one] for one in {*counts, *found}):
-            self._note(
+            note(
                 f'its statistics count {sum(counts.values())} messages, {found.total()} were found, '
                 'or their topics differ'
             )
-        if not self._data_is_right and self._unchecked:
-            self._doubt('it has no checksums of its messages, so altered ones cannot be noticed')
-        elif not self._data_is_right and counts is None and not self._numbered:
-            self._doubt('it has no count of its messages')
+        if data_is_right:
+            return
+        if self._unchecked:
+            doubt('it has no checksums of its messages, so altered ones cannot be noticed')
+        elif counts is None and not self._is_journal:
+            doubt('it has no count of its messages')
 
 
 def read_mcap(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
@@ -236,7 +169,95 @@ def read_mcap(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
         note: Is called with a description of each loss.
         doubt: Is called with what cannot be checked.
     """
-    return _McapFile(file, note, doubt).read()
+    size = file.seek(0, 2)
+    file.seek(0)
+    if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
+        note(f'its {size} bytes are not the start of an MCAP file')
+        return
+    claims, schemas = _Claims(), dict[int, Schema]()
+    good, opcode = len(MCAP_MAGIC), 0
+    # Where a record is invalid, the position of the next one is unknown.
+    with suppress(*_INVALID):
+        for opcode, payload, end in _walk(file, size):
+            if opcode == Opcode.CHUNK:
+                yield from _in_chunk(payload, schemas, claims, note, cut=end > size)
+            elif end <= size:
+                record = _parsed(opcode, payload)
+                yield from _contents(record, schemas, claims, checked=False)
+                if not claims.may_have(opcode):
+                    note(f'a record has the opcode {opcode}, which is none of a journal')
+                if opcode == Opcode.ATTACHMENT and payload[-4:] not in (
+                    bytes(4),
+                    _checksum(payload[:-4]),
+                ):
+                    note(f'an attachment of {len(payload)} bytes is damaged: it is left out')
+                claims.take(record, end - len(payload) - _HEAD.size, end)
+            if end <= size:
+                good = end
+    file.seek(good)
+    if good == size and opcode != Opcode.FOOTER:
+        doubt('it has no end: what its writer had not written yet is not in it')
+    elif opcode != Opcode.FOOTER or file.read(len(MCAP_MAGIC) + 1) != MCAP_MAGIC:
+        note(f'it is cut off: the last {size - good} of its {size} bytes are not a complete record')
+    claims.compare(file, note, doubt)
+
+
+def _in_chunk(
+    payload: bytes, schemas: dict[int, Schema], claims: _Claims, note: Note, *, cut: bool
+) -> Iterator[Found]:
+    """Yield what is in a chunk, which may be cut off, up to an invalid record."""
+    try:
+        # The library reads what there is of a chunk that is cut off.
+        chunk = Chunk.read(ReadDataStream(BytesIO(payload)))
+        data = unpack(chunk.compression, chunk.data, chunk.uncompressed_size)
+    except (*UNPACK_ERRORS, *_INVALID) as error:
+        why = str(error) or 'it is too short'
+        note(f'a chunk of {len(payload)} bytes cannot be unpacked: {why}')
+        return
+    size, checksum = chunk.uncompressed_size, chunk.uncompressed_crc
+    right = len(data) == size and checksum in (0, zlib.crc32(data))
+    if not cut and not right:
+        seconds = (chunk.message_end_time - chunk.message_start_time) / NANOSECONDS
+        what = f'a chunk of {size} bytes ({seconds:.1f} s)'
+        note(f'{what} is damaged: its messages may be altered')
+    good = 0
+    with suppress(*_INVALID):
+        for opcode, record, end in _walk(BytesIO(data), len(data)):
+            if end <= len(data):
+                parsed = _parsed(opcode, record)
+                yield from _contents(parsed, schemas, claims, checked=checksum != 0)
+                good = end
+    if good < len(data) and not cut:
+        note(f'the last {len(data) - good} of the {size} bytes of a chunk are not complete records')
+
+
+def _contents(
+    record: McapRecord | None, schemas: dict[int, Schema], claims: _Claims, *, checked: bool
+) -> Iterator[Found]:
+    """Yield what is in a complete record."""
+    if isinstance(record, McapMessage):
+        claims.met_message(record, checked=checked)
+        yield Message(record.channel_id, record.log_time, record.data, record.sequence)
+    elif isinstance(record, Schema):
+        schemas[record.id] = record
+    elif isinstance(record, McapChannel):
+        schema = schemas.get(record.schema_id)
+        topic = Topic(
+            record.id,
+            record.topic,
+            schema.name if schema else '',
+            record.message_encoding,
+            record.metadata.get('offered_qos_profiles', ''),
+            record.metadata.get('topic_type_hash', ''),
+            schema.data.decode() if schema else '',
+        )
+        claims.met_topic(topic, checked=checked)
+        yield topic
+    elif isinstance(record, Attachment):
+        if record.media_type == CUSTOM_DATA:
+            yield Text(record.name, record.data.decode())
+    elif isinstance(record, Metadata) and record.name == 'rosbag2':
+        yield record.metadata.get('serialized_metadata', '')
 
 
 def _walk(file: BinaryIO, size: int) -> Iterator[tuple[int, bytes, int]]:

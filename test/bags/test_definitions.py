@@ -16,16 +16,15 @@ from support.raw_bags import channel
 
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.bag_writer import build_bag
-from diffdrive_jacobian.bags.damaged_bag import definition_and_hash
 from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.bags.message_definitions import (
     UnknownTypeError,
     definition,
+    definition_and_hash,
     known_definition,
     message_class,
     recorded_definition_differs,
 )
-from diffdrive_jacobian.bags.salvage import Topic
 from diffdrive_jacobian.messages.topics import TOPICS
 
 TYPES = sorted({kind for topic in TOPICS.values() for kind in topic.types})
@@ -214,21 +213,20 @@ def test_definitions_of_a_bag_never_become_code(tmp_path, monkeypatch):
     read_run(tmp_path / 'bag')
     monkeypatch.setattr('rosbags.typesys.store.generate_python_code', generated)
     assert len(read_run(tmp_path / 'bag').odometry) == 1
-    foreign = Topic(1, '/x', 'evil_msgs/msg/Evil', 'cdr', '', '', 'int32 a\nint32 class\n')
-    text, type_hash = definition_and_hash(foreign)
-    assert text == foreign.definition
+    foreign = 'int32 a\nint32 class\n'
+    text, type_hash = definition_and_hash('evil_msgs/msg/Evil', foreign, '')
+    assert text == foreign
     assert type_hash.startswith('RIHS01_')
 
 
 def test_a_parsed_definition_has_the_hash_of_the_type():
     for name in (*TYPES, 'tf2_msgs/msg/TFMessage'):
         known = known_definition(name)
-        other = Topic(1, '/x', name.replace('/msg/', '/msg/X'), 'cdr', '', '', known.text)
-        assert definition_and_hash(Topic(1, '/x', name, 'cdr', '', '', ''))[1] == known.type_hash
-        assert definition_and_hash(other)[1] != known.type_hash
+        other = name.replace('/msg/', '/msg/X')
+        assert definition_and_hash(name, '', '')[1] == known.type_hash
+        assert definition_and_hash(other, known.text, '')[1] != known.type_hash
         # Recorded with another definition, which is kept.
-        foreign = Topic(1, '/x', name, 'cdr', '', OTHER_HASH, 'float64 x\n')
-        assert definition_and_hash(foreign) == ('float64 x\n', OTHER_HASH)
+        assert definition_and_hash(name, 'float64 x\n', OTHER_HASH) == ('float64 x\n', OTHER_HASH)
     for text in ('evil_msgs/Evil a\n', 'x' * 1000, '%', '\0'):
         with pytest.raises(UnknownTypeError):
-            definition_and_hash(Topic(1, '/x', 'evil_msgs/msg/Evil', 'cdr', '', '', text))
+            definition_and_hash('evil_msgs/msg/Evil', text, '')
