@@ -44,7 +44,7 @@ MAX_DOMAIN_ID = 232
 """Largest domain id. The ports of larger ones do not exist."""
 CHECK_PERIOD = 0.1
 """Longest time between two checks of the condition of the loop (s)."""
-PATIENCE = 1.0
+PATIENCE = 0.5
 """Longest wait for acknowledgements at the end (s)."""
 _A_MOMENT = Duration(seconds=0.01)
 RULES = {'-p': 'NAME:=VALUE', '--param': 'NAME:=VALUE', '-r': 'OLD:=NEW', '--remap': 'OLD:=NEW'}
