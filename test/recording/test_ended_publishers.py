@@ -1,0 +1,59 @@
+"""Publishers that end right after their last messages: what record_run says of them."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+from fork_server import forked
+from support.raw_bags import read_bag
+
+pytestmark = pytest.mark.process
+
+PUBLISHER = """
+import os, sys, time
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import String
+
+count, size, period = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
+rclpy.init()
+node = Node('ends')
+publisher = node.create_publisher(String, 'said', 10)
+while not publisher.get_subscription_count():
+    time.sleep(0.02)
+time.sleep(0.3)
+for number in range(count):
+    publisher.publish(String(data='x' * size))
+    time.sleep(period)
+# Not even its participant is taken back.
+os._exit(0)
+"""
+
+
+@pytest.fixture
+def recorded(world, tmp_path):
+    """A function that records a publisher; returns the number of messages, exit code, and output."""
+
+    def record(name, *publisher):
+        child = world.start('record_run', '/said', '-o', str(tmp_path / name))
+        child.until_says('recording to')
+        assert forked.run(PUBLISHER, [str(one) for one in publisher], timeout=60).returncode == 0
+        child.signal(signal.SIGINT)
+        code = child.exit()
+        return len(read_bag(tmp_path / name)), code, child.stdout + child.stderr
+
+    return record
+
+
+def test_one_that_is_slow_is_recorded_completely(recorded):
+    count, code, said = recorded('slow', 25, 500, 0.02)
+    assert (count, code) == (25, 0), said
+    assert 'waiting' not in said
+
+
+@pytest.mark.parametrize('number', range(3))
+def test_one_that_overflows_the_buffer_is_not_called_complete(recorded, number):
+    """As much as three buffers hold at once: the rest would be sent again, by a publisher that lives."""
+    count, code, said = recorded(f'burst_{number}', 10, 60_000, 0.0)
+    assert count == 10 or (code == 1 and 'possibly the end of /said' in said), said
