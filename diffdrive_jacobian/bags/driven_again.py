@@ -138,91 +138,88 @@ def _nearest(events: list[Event], odometry: Series, index: int) -> Robot | None:
 # --- By the commands as they were applied
 
 
+class _Row(NamedTuple):
+    """A message of `cmd_vel_out` or `start_pose`, in the order of recording."""
+
+    received: int
+    stamp: int
+    values: NDArray[np.float64]
+    """`[v, omega]`, or `[x, y, theta]` and the covariance by rows."""
+    model: RobotModel | None
+    """How the robot follows commands from this one on. None: it is a start."""
+
+
 def _applied(run: Run) -> Driven:
     """Return the robot after each event of `cmd_vel_out` and `start_pose`."""
-    starts, commands = run.start_pose, run.cmd_vel_out
-    nominal = recorded_model(run) or RobotModel()
     dynamics = recorded_dynamics(run)
-    first_model, *models = dynamics or [nominal] * (len(commands) + 1)
-    delay = first_model.actuators.delay
-    begins = _known_since(run, delay)
-    latched = _starts_before_recording(run)
-    stood = latched > 0 and _stood_since(run, latched - 1)
-    whole = not begins and len(starts) > 0 and (not latched or stood)
-    settled = dynamics and not whole and (begins or not _rests(run, delay))
-    if settled:
-        begins = _settled_since(run, dynamics)
-    if whole:
-        which = latched - 1 if stood else 0
-        covariance = start_covariances(run)[which].reshape(3, 3)
-        robot = Robot(
-            model=first_model,
-            stamp=int(starts.stamps[which]),
-            pose=starts.values[which],
-            covariance=covariance,
-        )
-        # A latched message may have been received later than what followed it.
-        first, skipped = Event(robot, 0), which + 1
-    else:
-        robot, begun = _moving(run, begins), int(run.odometry.received[begins])
-        if settled:
-            robot = _following(robot, run, dynamics)
-        # The command that was recorded before the odometry is in effect in its first message.
-        driven = (commands.stamps <= robot.stamp) & (commands.received <= begun + MARGIN)
-        first, skipped = Event(robot, begun, is_command=bool(driven.any())), latched
-        if begins:
-            skipped = int(np.count_nonzero(starts.stamps < robot.stamp)) - _restarts(run)
+    nominal = recorded_model(run) or RobotModel()
+    first_model, *models = dynamics or [nominal] * (len(run.cmd_vel_out) + 1)
+    first, whole, missed = _beginning(run, first_model, dynamics)
     epochs, model = [[first]], first_model
-    for received, stamp, changed, row in _recorded_events(run, skipped, models):
-        latest = epochs[-1][-1].robot
-        is_start, model = changed is None, changed or model
-        if is_start:
-            pose, covariance = row[:3], row[3:].reshape(3, 3)
-            if stamp < latest.stamp:
-                epochs.append([])
-                robot = Robot(model=model, stamp=stamp, pose=pose, covariance=covariance)
-            else:
-                moved = latest.placed(pose, covariance, stamp)
-                reset = latest.placed(pose, covariance, stamp, odometry_only=True)
-                robot = _placed_as_recorded(run, moved, reset)
-        elif stamp < latest.stamp:
-            # From before the start, or from before time went back.
-            continue
+    for row in _rows(run, models, first, whole=whole):
+        robot = epochs[-1][-1].robot
+        if row.model is not None:
+            if row.stamp < robot.stamp:
+                # From before the start, or from before time went back.
+                continue
+            model = row.model
+            if model != robot.model:
+                robot = robot.remodelled(model, row.stamp)
+            robot = robot.commanded(tuple(row.values.tolist()), row.stamp)
         else:
-            if model != latest.model:
-                latest = latest.remodelled(model, stamp)
-            robot = latest.commanded((float(row[0]), float(row[1])), stamp)
-        epochs[-1].append(Event(robot, received, is_command=not is_start))
-    return Driven(
-        source='cmd_vel_out',
-        start='start_pose' if whole else 'odometry',
-        epochs=epochs,
-        missed=begins > 0,
-    )
+            pose, covariance = row.values[:3], row.values[3:].reshape(3, 3)
+            if row.stamp < robot.stamp:
+                epochs.append([])
+                robot = Robot(model=model, stamp=row.stamp, pose=pose, covariance=covariance)
+            else:
+                moved = robot.placed(pose, covariance, row.stamp)
+                reset = robot.placed(pose, covariance, row.stamp, odometry_only=True)
+                robot = _placed_as_recorded(run, moved, reset)
+        epochs[-1].append(Event(robot, row.received, is_command=row.model is not None))
+    start = 'start_pose' if whole else 'odometry'
+    return Driven(source='cmd_vel_out', start=start, epochs=epochs, missed=missed)
 
 
-def _recorded_events(
-    run: Run, skipped: int, models: list[RobotModel]
-) -> list[tuple[int, int, RobotModel | None, NDArray[np.float64]]]:
-    """Return starts and commands in the order of their recording: received, stamp, model, values.
-
-    The model is that from a command on; None: a start, whose values are its pose and its covariance.
-    """
+def _rows(run: Run, models: list[RobotModel], first: Event, *, whole: bool) -> list[_Row]:
+    """Return the messages that come after the start of the robot."""
     starts, commands = run.start_pose, run.cmd_vel_out
+    if whole:
+        skipped = int(np.flatnonzero(starts.stamps == first.robot.stamp)[0]) + 1
+    else:
+        # Latched ones: where time goes back, a start with an earlier stamp comes, too.
+        restarts = np.count_nonzero(np.diff(run.odometry.stamps) < 0)
+        skipped = max(int(np.count_nonzero(starts.stamps < first.robot.stamp) - restarts), 0)
     placed = np.hstack([starts.values, start_covariances(run)])
-    no_model: list[RobotModel | None] = [None] * len(starts)
-    rows = [*zip(starts.received.tolist(), starts.stamps.tolist(), no_model, placed, strict=True)]
-    rows = rows[max(skipped, 0) :]
-    rows += zip(
-        commands.received.tolist(), commands.stamps.tolist(), models, commands.values, strict=True
-    )
+    none = [None] * len(starts)
+    rows = [*map(_Row, starts.received.tolist(), starts.stamps.tolist(), placed, none)][skipped:]
+    rows += map(_Row, commands.received.tolist(), commands.stamps.tolist(), commands.values, models)
     # A placement comes after the timeout that it noticed, which took effect before.
     return sorted(rows, key=lambda row: row[:2])
 
 
-def _restarts(run: Run) -> int:
-    """Return how often time goes back in the odometry."""
-    return int(np.count_nonzero(np.diff(run.odometry.stamps) < 0))
+def _beginning(run: Run, model: RobotModel, dynamics: list[RobotModel]) -> tuple[Event, bool, bool]:
+    """Return the start of the robot, whether it is a `start_pose`, and whether commands were missed."""
+    starts, commands = run.start_pose, run.cmd_vel_out
+    delay = model.actuators.delay
+    index = _known_since(run, delay)
+    latched = _starts_before_recording(run)
+    stood = latched > 0 and _stood_since(run, latched - 1)
+    if not index and (stood or (len(starts) and not latched)):
+        which = latched - 1 if stood else 0
+        covariance = start_covariances(run)[which].reshape(3, 3)
+        stamp, pose = int(starts.stamps[which]), starts.values[which]
+        robot = Robot(model=model, stamp=stamp, pose=pose, covariance=covariance)
+        # As it is latched, it may have been received later than what followed it.
+        return Event(robot, 0), True, False
+    if not dynamics or (not index and _rests(run, delay)):
+        robot = _moving(run, index)
+    else:
+        index = _settled_since(run, dynamics)
+        robot = _following(_moving(run, index), run, dynamics)
+    # The command that was recorded before the odometry is in effect in its first message.
+    received = int(run.odometry.received[index])
+    driven = (commands.stamps <= robot.stamp) & (commands.received <= received + MARGIN)
+    return Event(robot, received, is_command=bool(driven.any())), False, index > 0
 
 
 def _moving(run: Run, index: int) -> Robot:
