@@ -6,6 +6,7 @@ import signal
 
 import pytest
 from fork_server import forked
+from std_msgs.msg import String
 from support.raw_bags import read_bag
 
 pytestmark = pytest.mark.process
@@ -57,3 +58,34 @@ def test_one_that_overflows_the_buffer_is_not_called_complete(recorded, number):
     """As much as three buffers hold at once: the rest would be sent again, by a publisher that lives."""
     count, code, said = recorded(f'burst_{number}', 10, 60_000, 0.0)
     assert count == 10 or (code == 1 and 'possibly the end of /said' in said), said
+
+
+NODE = """
+import sys, time
+from rclpy.node import Node
+from std_msgs.msg import String
+from diffdrive_jacobian.ros.fastdds_profiles import open_to_others
+from diffdrive_jacobian.ros.runner import ros_context, running
+
+open_to_others()
+with ros_context(['ends']) as context, running(context, isolated=False) as runner:
+    node = runner.add(lambda: Node('ends', context=context))
+    publisher = node.create_publisher(String, 'said', 10)
+    assert runner.spin(lambda: publisher.get_subscription_count() > 0, timeout=30.0)
+    time.sleep(0.3)
+    for number in range(10):
+        publisher.publish(String(data=f'{number}' * 60_000))
+"""
+
+
+@pytest.mark.parametrize('number', range(3))
+def test_a_node_of_ours_ends_when_its_last_messages_have_arrived(world, number):
+    received = []
+    take = received.append
+    subscription = world.harness.peer.create_subscription(String, 'said', take, 100)
+    process = forked.Popen(NODE)
+    world.harness.until(lambda: process.poll() is not None, 'it ends', patience=40.0)
+    assert process.wait() == 0
+    world.harness.until(lambda: len(received) == 10, 'all has arrived')
+    assert [one.data[0] for one in received] == [*'0123456789']
+    world.harness.peer.destroy_subscription(subscription)
