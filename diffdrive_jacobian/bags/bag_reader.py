@@ -214,7 +214,7 @@ def recorded_parameters(reader: Reader) -> dict[str, dict[str, Any]]:
 def messages(
     reader: Reader, connections: Sequence[Connection], invalid: Counter[str] | None = None
 ) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield the messages of some topics in the order of their recording.
+    """Yield the messages of some topics by the time of their recording.
 
     Args:
         reader: An open bag.

@@ -224,19 +224,23 @@ class DamagedBag:
                 for (_, end, first), (start, _, second) in pairwise(sorted(found.times))
                 if start < end
             ]
-        seen, counts, count = found.seen, metadata.topic_counts, metadata.message_count
-        pairs = [(number, seen[topic]) for topic, number in counts.items()]
-        pairs += [] if count is None else [(count, seen.total())]
-        if any(number != there for number, there in pairs):
-            topics = ', '.join(
-                f'{printable(topic)} {seen[topic]} of {number}'
-                for topic, number in counts.items()
-                if number != seen[topic]
-            )
-            difference = f'{source} counts {count} messages, {seen.total()} were found'
-            difference += f' ({topics})' if topics else ''
-            fewer = any(number > there for number, there in pairs)
-            (found.lost if fewer else found.unchecked).append(difference)
+        self._compare_with(source, metadata)
+
+    def _compare_with(self, source: str, metadata: Metadata) -> None:
+        seen, count = self.found.seen, metadata.message_count
+        differing = {
+            topic: number for topic, number in metadata.topic_counts.items() if number != seen[topic]
+        }
+        total = seen.total()
+        if not differing and count in (None, total):
+            return
+        topics = ', '.join(
+            f'{printable(topic)} {seen[topic]} of {number}' for topic, number in differing.items()
+        )
+        difference = f'{source} counts {count} messages, {total} were found'
+        difference += f' ({topics})' if topics else ''
+        fewer = (count or 0) > total or any(number > seen[topic] for topic, number in differing.items())
+        (self.found.lost if fewer else self.found.unchecked).append(difference)
 
     def _compare_descriptions(self) -> None:
         """Compare metadata.yaml with the topics in the files, and with its copy there."""

@@ -81,7 +81,7 @@ def robots_at_odometry(
     """
     stamps, epochs = run.odometry.stamps, driven.epochs
     # How often time went back before each message.
-    of_message = [0, *np.cumsum(np.diff(stamps) < 0).tolist()]
+    of_message = np.searchsorted(run.odometry.back, range(len(stamps)), side='right').tolist()
     if of_message[-1] >= len(epochs):
         raise BagError(
             f'{run.path} cannot be followed: time goes back {of_message[-1]} times in the odometry, but '
@@ -187,8 +187,8 @@ def _rows(run: Run, models: list[RobotModel], first: Event, *, whole: bool) -> l
         skipped = int(np.flatnonzero(starts.stamps == first.robot.stamp)[0]) + 1
     else:
         # Latched ones: where time goes back, a start with an earlier stamp comes, too.
-        restarts = np.count_nonzero(np.diff(run.odometry.stamps) < 0)
-        skipped = max(int(np.count_nonzero(starts.stamps < first.robot.stamp) - restarts), 0)
+        earlier = int(np.count_nonzero(starts.stamps < first.robot.stamp))
+        skipped = max(earlier - len(run.odometry.back), 0)
     placed = np.hstack([starts.values, start_covariances(run)])
     none = [None] * len(starts)
     rows = [*map(_Row, starts.received.tolist(), starts.stamps.tolist(), placed, none)][skipped:]
@@ -369,9 +369,9 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> Driven:
         )
     rows: list[tuple[int, Any]] = list(zip(series.received.tolist(), series.values, strict=True))
     rows += [
-        (received, changes)
-        for received, node, changes in run.parameter_events
-        if base_name(node) == ROBOT
+        (received, change.values)
+        for received, change in run.parameter_events
+        if base_name(change.node) == ROBOT
     ]
     rows.sort(key=lambda row: row[0])
     before = max(int(np.searchsorted(run.odometry.stamps, int(series.received[0]))) - 1, 0)

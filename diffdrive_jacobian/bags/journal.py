@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import threading
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 
@@ -65,8 +65,6 @@ class Message:
     channel: int
     stamp: int
     data: bytes
-    number: int = field(default=0, compare=False)
-    """Its number in the file from which it was read; 0: it has none."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,6 +67,12 @@ def is_known(type_name: str) -> bool:
     return type_name in _typestore().fielddefs
 
 
+def _store_with(type_name: str) -> Typestore:
+    if not is_known(type_name):
+        raise UnknownTypeError(f'{printable(type_name)} is not a type of ROS 2 Jazzy')
+    return _typestore()
+
+
 @cache
 def known_definition(type_name: str) -> Definition:
     """Return the definition of a type (`package/msg/Name`) that is known without ROS.
@@ -74,9 +80,7 @@ def known_definition(type_name: str) -> Definition:
     Raises:
         UnknownTypeError: It is not known.
     """
-    if not is_known(type_name):
-        raise UnknownTypeError(f'{printable(type_name)} is not a type of ROS 2 Jazzy')
-    store = _typestore()
+    store = _store_with(type_name)
     text, _ = store.generate_msgdef(type_name, ros_version=2)
     return Definition(name=type_name, text=text, type_hash=store.hash_rihs01(type_name))
 
@@ -88,9 +92,7 @@ def known_structure(type_name: str) -> Structure:
     Raises:
         UnknownTypeError: It is not known.
     """
-    if not is_known(type_name):
-        raise UnknownTypeError(f'{printable(type_name)} is not a type of ROS 2 Jazzy')
-    return _structure(_typestore().fielddefs, type_name)
+    return _structure(_store_with(type_name).fielddefs, type_name)
 
 
 def installed_structure(type_name: str) -> Structure:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -34,7 +33,6 @@ _MOTOR_FAULTS: dict[str, Callable[[Actuators, Mapping[str, Any]], Actuators]] = 
     'SaturatedWheel': lambda actuators, fault: actuators.weakened(fault['wheel'], fault['max_velocity']),
 }
 """What the faults that change how a robot follows commands do to its actuators."""
-_NEVER = int(np.iinfo(np.int64).max)
 
 
 def recorded_model(run: Run) -> RobotModel | None:
@@ -43,9 +41,9 @@ def recorded_model(run: Run) -> RobotModel | None:
     # A robot that starts later than the recorder reports its first values as changes.
     changed = {
         name
-        for _, node, values in run.parameter_events
-        if base_name(node) == ROBOT
-        for name, value in values.items()
+        for _, change in run.parameter_events
+        if base_name(change.node) == ROBOT
+        for name, value in change.values.items()
         if value != recorded.get(name)
     }
     separation, variance = (run.number_of_node(ROBOT, name, math.nan) for name in _NOISE_PARAMETERS)
@@ -87,29 +85,27 @@ def recorded_dynamics(run: Run) -> list[RobotModel]:
 def _changes_by_command(run: Run) -> dict[int, list[dict[str, Any] | FaultEvent]]:
     """Return parameters and faults that changed, by the message of `cmd_vel_out` from which they count.
 
-    The robot publishes its command again after each change.
+    The robot publishes its command again when they change, each time in a message of its own: for
+    parameters after it has announced them, for a fault after the world has announced that.
     """
-    received, stamps = run.cmd_vel_out.received.tolist(), run.cmd_vel_out.stamps
+    received, stamps = run.cmd_vel_out.received, run.cmd_vel_out.stamps
     changes: dict[int, list[dict[str, Any] | FaultEvent]] = defaultdict(list)
-    times = run.parameter_stamps
-    if len(times) != len(run.parameter_events):
-        times = tuple(recorded for recorded, *_ in run.parameter_events)
-    for (recorded, node, values), stamp in zip(run.parameter_events, times, strict=True):
-        if base_name(node) != ROBOT:
-            continue
-        first = bisect_left(received, recorded - MARGIN)
-        last = bisect_right(received, recorded + MARGIN)
-        later = first + np.flatnonzero(stamps[first:last] >= stamp)
-        # Of several changes at one time each has a message of its own.
-        earliest = stamps[later] == np.min(stamps[later], initial=_NEVER)
-        together = later[earliest].tolist() or [last]
-        free = [index for index in together if index not in changes]
-        changes[int((free or together)[0 if free else -1])].append(values)
+
+    def is_free(index: int) -> bool:
+        return index not in changes
+
+    for recorded, change in run.parameter_events:
+        if base_name(change.node) == ROBOT:
+            first, last = np.searchsorted(received, [recorded - MARGIN, recorded + MARGIN + 1])
+            later = [one for one in range(first, last) if stamps[one] >= change.stamp]
+            # Of those at the earliest time, that of no other change, or the last one.
+            together = [one for one in later if stamps[one] == min(stamps[later])] or [int(last)]
+            changes[next(filter(is_free, together), together[-1])].append(change.values)
     for recorded, event in run.fault_events:
         if event.kind in _MOTOR_FAULTS and base_name(event.arguments.get('robot') or ROBOT) == ROBOT:
-            # As above. Where one fault ends and another begins, the robot is without both in between.
-            index = bisect_left(received, recorded)
-            while index in changes and received[index + 1 : index + 2] == [recorded]:
+            index = int(np.searchsorted(received, recorded))
+            # Where one fault ends and another begins, the robot is without both in between.
+            while not is_free(index) and received[index + 1 : index + 2].tolist() == [recorded]:
                 index += 1
             changes[index].append(event)
     return changes

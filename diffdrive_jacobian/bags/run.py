@@ -15,30 +15,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bag_reader import (
     BagError,
-    ReadingInterruptedError,
     custom_data,
     lost_messages,
-    messages,
     noted_losses,
     open_bag,
     recorded_parameters,
-    stored_connections,
 )
-from diffdrive_jacobian.bags.message_definitions import (
-    known_structure,
-    recorded_definition_differs,
-    type_hashes,
-)
-from diffdrive_jacobian.messages.cdr import DecodingError
+from diffdrive_jacobian.bags.decoded import read_messages
 from diffdrive_jacobian.messages.codecs import Changes, FaultEvent
-from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import base_name, namespace_of
 from diffdrive_jacobian.messages.topics import READABLE, TABLES, Topic
-from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 if TYPE_CHECKING:
@@ -56,7 +47,7 @@ WHEELS = ('left_wheel_joint', 'right_wheel_joint')
 
 @dataclass(frozen=True, kw_only=True, slots=True, repr=False)
 class Series:
-    """The messages of one topic in the order in which they were recorded; n may be 0."""
+    """The messages of one topic, sorted by the time of their recording; n may be 0."""
 
     received: NDArray[np.int64]
     """When each message was recorded, shape (n,) (ns)."""
@@ -70,6 +61,11 @@ class Series:
     def __len__(self) -> int:
         """Return n."""
         return len(self.stamps)
+
+    @property
+    def back(self) -> NDArray[np.intp]:
+        """Before which messages time goes back, by their stamps, ascending indices."""
+        return np.flatnonzero(np.diff(self.stamps) < 0) + 1
 
     def __repr__(self) -> str:
         """Return a summary of one line."""
@@ -117,10 +113,8 @@ class Run:
     """The entries xx, xy, xt, yy, yt, tt of the covariance in each start_pose, shape (n, 6)."""
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     """By the full name of the node, as of the beginning of the run."""
-    parameter_events: tuple[tuple[int, str, dict[str, Any]], ...] = ()
-    """Later changes: when each was recorded (ns), the node, the new values."""
-    parameter_stamps: tuple[int, ...] = ()
-    """The stamps of these changes (ns)."""
+    parameter_events: tuple[tuple[int, Changes], ...] = ()
+    """Later changes of parameters, each with when it was recorded (ns)."""
     fault_events: tuple[tuple[int, FaultEvent], ...] = ()
     """What the faults of a lockstep world did, each with when it was recorded (ns)."""
     skipped: dict[str, int] = field(default_factory=dict)
@@ -173,10 +167,10 @@ class Run:
         """Yield the run with the parameters of each time, and since when they are valid (ns), from 0."""
         run, since = self, 0
         yield since, run
-        for received, node, values in self.parameter_events:
+        for received, change in self.parameter_events:
             since = max(since, received)
-            values = {**run.parameters.get(node, {}), **values}
-            run = replace(run, parameters={**run.parameters, node: values})
+            values = {**run.parameters.get(change.node, {}), **change.values}
+            run = replace(run, parameters={**run.parameters, change.node: values})
             yield since, run
 
     def number_of_node(self, node: str, parameter: str, default: float) -> float:
@@ -222,10 +216,21 @@ def read_run(
     """
     path = Path(path)
     rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = defaultdict(list)
-    events: list[tuple[int, Changes]] = []
+    changes: list[tuple[int, Changes]] = []
     fault_events: list[tuple[int, FaultEvent]] = []
-    read, invalid = Counter[str](), Counter[str]()
-    skipped = Counter[tuple[str, str]]()
+
+    def take(connection: Connection, received: int, value: Any) -> None:
+        table = chosen[connection.id].table
+        if isinstance(value, Changes):
+            if namespace in (None, namespace_of(value.node)):
+                changes.append((received, value))
+        elif isinstance(value, FaultEvent):
+            fault_events.append((received, value))
+        elif table is not None:
+            rows[table.series] += [
+                (received, stamp or received, row) for stamp, row in table.rows(value, names)
+            ]
+
     with open_bag(path) as reader:
         parameters = {
             node: values
@@ -234,49 +239,10 @@ def read_run(
         }
         names = _wheel_names(parameters)
         chosen = _choose(reader, dict(topics or {}), namespace)
-        connections = [one for one in reader.connections if one.id in chosen]
-        stored = stored_connections(reader)
-        foreign = {
-            one.id
-            for one in connections
-            if recorded_definition_differs(one.msgtype, type_hashes(one, stored))
-        }
-        decode = {
-            one.id: chosen[one.id].codec(one.msgtype).reader(known_structure(one.msgtype))
-            for one in connections
-        }
-        for connection, received, data in messages(reader, connections, invalid):
-            if interrupted():
-                raise ReadingInterruptedError
-            topic, name = chosen[connection.id], connection.topic
-            read[name] += 1
-            if connection.id in foreign:
-                skipped[name, f'were recorded with another definition of {connection.msgtype}'] += 1
-                continue
-            try:
-                value = decode[connection.id](data)
-                if isinstance(value, Changes):
-                    if namespace in (None, namespace_of(value.node)):
-                        events.append((received, value))
-                elif isinstance(value, FaultEvent):
-                    fault_events.append((received, value))
-                elif topic.table is not None:
-                    rows[topic.table.series] += [
-                        (received, stamp or received, row)
-                        for stamp, row in topic.table.rows(value, names)
-                    ]
-            except DecodingError:
-                skipped[name, 'cannot be decoded as little-endian CDR'] += 1
-            except MessageError:
-                # The nodes drop it as well.
-                skipped[name, 'hold invalid or implausible values'] += 1
+        types = {one.id: one.msgtype for one in reader.connections}
+        codecs = {number: topic.codec(types[number]) for number, topic in chosen.items()}
+        tally = read_messages(reader, codecs, take, interrupted)
         noted = custom_data(reader)
-    for name, count in invalid.items():
-        skipped[name, 'cannot be decoded'] += count
-    expected = Counter[str]()
-    for connection in connections:
-        expected[connection.topic] += connection.msgcount
-    read += invalid
     series, covariances = {}, {}
     for table in TABLES:
         found, count = rows[table.series], len(table.columns)
@@ -294,37 +260,13 @@ def read_run(
         odometry_covariances=covariances['odometry'],
         start_covariances=covariances['start_pose'],
         parameters=parameters,
-        parameter_events=tuple((received, one.node, one.values) for received, one in events),
-        parameter_stamps=tuple(one.stamp for _, one in events),
+        parameter_events=tuple(changes),
         fault_events=tuple(fault_events),
-        skipped=dict(_by_topic(skipped)),
-        missing=dict(expected - read + Counter(lost_messages(noted))),
-        notes=(*_notes(skipped, read, expected), *(f'lost: {one}' for one in noted_losses(noted))),
+        skipped=tally.skipped,
+        missing=dict(tally.missing + Counter(lost_messages(noted))),
+        notes=(*tally.notes(), *(f'lost: {one}' for one in noted_losses(noted))),
         **series,
     )
-
-
-def _by_topic(skipped: Counter[tuple[str, str]]) -> Counter[str]:
-    """Return how many messages of each topic were skipped, of counts by topic and reason."""
-    found = Counter[str]()
-    for (topic, _), count in skipped.items():
-        found[topic] += count
-    return found
-
-
-def _notes(
-    skipped: Counter[tuple[str, str]], read: Counter[str], expected: Counter[str]
-) -> Iterator[str]:
-    """Describe messages that were skipped, or that the bag counts and that were not found, by topic."""
-    for topic in sorted(expected):
-        for (name, why), count in sorted(skipped.items()):
-            if name == topic:
-                yield f'{count} of {read[topic]} messages on {printable(topic)} {why} and were skipped'
-        if read[topic] != expected[topic]:
-            yield (
-                f'{read[topic]} messages on {printable(topic)} were found, '
-                f'the bag should have {expected[topic]}'
-            )
 
 
 def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dict[int, Topic]:

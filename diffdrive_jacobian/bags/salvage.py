@@ -121,6 +121,12 @@ class _Claims:
         """Return whether such a record may be outside of chunks: a journal has few kinds."""
         return not self._is_journal or not self._in_data or opcode in _IN_JOURNAL
 
+    def has_checksum(self, attachment: bytes) -> bool:
+        """Return whether an attachment has the right checksum, or none, as only others write it."""
+        content, checksum = attachment[:-4], attachment[-4:]
+        right = zlib.crc32(content).to_bytes(4, 'little')
+        return checksum == right or (checksum == bytes(4) and not self._is_journal)
+
     def met_message(self, message: McapMessage, *, checked: bool) -> None:
         """Count a message. `checked`: it is in a chunk with a checksum."""
         self.found[message.channel_id] += 1
@@ -183,14 +189,12 @@ def read_mcap(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
                 yield from _in_chunk(payload, schemas, claims, note, cut=end > size)
             elif end <= size:
                 record = _parsed(opcode, payload)
+                if opcode == Opcode.ATTACHMENT and not claims.has_checksum(payload):
+                    note(f'an attachment of {len(payload)} bytes is damaged: it is left out')
+                    record = None
                 yield from _contents(record, schemas, claims, checked=False)
                 if not claims.may_have(opcode):
                     note(f'a record has the opcode {opcode}, which is none of a journal')
-                if opcode == Opcode.ATTACHMENT and payload[-4:] not in (
-                    bytes(4),
-                    _checksum(payload[:-4]),
-                ):
-                    note(f'an attachment of {len(payload)} bytes is damaged: it is left out')
                 claims.take(record, end - len(payload) - _HEAD.size, end)
             if end <= size:
                 good = end
@@ -237,7 +241,7 @@ def _contents(
     """Yield what is in a complete record."""
     if isinstance(record, McapMessage):
         claims.met_message(record, checked=checked)
-        yield Message(record.channel_id, record.log_time, record.data, record.sequence)
+        yield Message(record.channel_id, record.log_time, record.data)
     elif isinstance(record, Schema):
         schemas[record.id] = record
     elif isinstance(record, McapChannel):
@@ -282,7 +286,7 @@ def _walk(file: BinaryIO, size: int) -> Iterator[tuple[int, bytes, int]]:
 
 
 def _parsed(opcode: int, payload: bytes) -> McapRecord | None:
-    """Parse a complete record; None: it is of a kind that is not read, or an altered attachment.
+    """Parse a complete record; None: it is of a kind that is not read.
 
     Raises:
         EndOfFile, ValueError: It is invalid.
@@ -291,15 +295,9 @@ def _parsed(opcode: int, payload: bytes) -> McapRecord | None:
     record: McapRecord | None = None
     if opcode == Opcode.MESSAGE:
         record = McapMessage.read(fields, len(payload))
-    elif opcode == Opcode.ATTACHMENT and payload[-4:] != _checksum(payload[:-4]):
-        pass
     elif kind := _RECORDS.get(opcode):
         record = kind.read(fields)
     return record
-
-
-def _checksum(content: bytes) -> bytes:
-    return zlib.crc32(content).to_bytes(4, 'little')
 
 
 # --- SQLite

@@ -26,6 +26,7 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+Times = NDArray[np.int64]
 
 _NEVER = int(np.iinfo(np.int64).max)
 TELEPORT = 0.1
@@ -153,7 +154,7 @@ def _breaks(run: Run) -> Indices:
     reset[jumps(run.odometry) - 1] = True
     received, starts = run.odometry.received, run.start_pose
     # Time goes back before these messages. Between them stamps do not decrease.
-    back = np.flatnonzero(np.diff(stamps) < 0) + 1
+    back = run.odometry.back
     edges = [0, *back.tolist(), len(stamps)]
     passes = np.searchsorted(received[back - 1], starts.received).tolist()
     for which, at, stamp, pose in zip(
@@ -197,40 +198,32 @@ def _progress(
         if not route:
             continue
         here, end = np.searchsorted(seen, [begun, until]).tolist()
-        stop = end
-        if state in (GoalState.CANCELED, GoalState.ABORTED):
-            stop = min(stop, int(np.searchsorted(seen, followed.since, side='right')))
         succeeded = state is GoalState.SUCCEEDED
+        ended = state in (GoalState.CANCELED, GoalState.ABORTED) or (succeeded and sent.is_path)
+        stop = min(end, int(np.searchsorted(seen, followed.since, side='right'))) if ended else end
         if sent.is_path:
-            if succeeded:
-                stop = min(stop, int(np.searchsorted(seen, followed.since, side='right')))
             driven[here:stop] = which
             continue
         for target in route[:-1]:
-            next_here = _first_within(run, places, target, here, stop)
-            if next_here is None and here < stop and (succeeded or not known):
-                next_here = here + int(np.argmin(_distances(run, places[here:stop], target)))
-            goal[here : stop if next_here is None else next_here] = target
-            if next_here is None:
+            passed = _first_within(run, places, target, here, stop)
+            if passed is None and here < stop and (succeeded or not known):
+                passed = here + int(np.argmin(_distances(run, places[here:stop], target)))
+            goal[here : stop if passed is None else passed] = target
+            if passed is None:
                 break
-            here = next_here
+            here = passed
         else:
-            last, begin = route[-1], here
-            goal[begin:stop] = last
-            within = _within(run, places[begin:stop], last)
-            if succeeded:
-                here += _arrival(within, int(np.searchsorted(seen, followed.since)) - begin)
-            elif within.any() and followed.fate is Fate.WAITING:
-                here += int(np.argmax(within))
-            else:
+            goal[here:stop] = route[-1]
+            within = _within(run, places[here:stop], route[-1])
+            if (arrived := _arrival(within, followed, seen[here:stop])) is None:
                 # The node still drives to it, even if the robot was near it once.
                 continue
-            over = breaks[(breaks > here) & (breaks <= stop)]
+            over = breaks[(breaks > here + arrived) & (breaks <= stop)]
             if not succeeded:
                 # A robot that had left the goal again only passed it.
-                over = over[within[over - 1 - begin]]
-            stop = min([stop, *over.tolist()])
-            goal[stop:end], reached[here:stop] = -1, True
+                over = over[within[over - 1 - here]]
+            left = min([stop, *over.tolist()])
+            goal[left:end], reached[here + arrived : left] = -1, True
     return goal, reached, driven
 
 
@@ -304,10 +297,21 @@ def _first_within(run: Run, places: Array, target: int, begin: int, end: int) ->
     return None
 
 
-def _arrival(within: Mask, success: int) -> int:
-    """Return since which place the robot was at the goal when the node reported success there."""
-    outside = np.flatnonzero(~within[: success + 1])
-    return min(int(outside[-1]) + 1 if len(outside) else 0, success)
+def _arrival(within: Mask, followed: FollowedGoal[Any], seen: Times) -> int | None:
+    """Return since which place the robot was at its last goal, for good as far as is known; None: never.
+
+    Args:
+        within: Which places count as arrived.
+        followed: What is known of the goal.
+        seen: When each place was recorded (ns).
+    """
+    if followed.state is GoalState.SUCCEEDED:
+        success = int(np.searchsorted(seen, followed.since))
+        outside = np.flatnonzero(~within[: success + 1])
+        return min(int(outside[-1]) + 1 if len(outside) else 0, success)
+    if followed.fate is Fate.WAITING and within.any():
+        return int(np.argmax(within))
+    return None
 
 
 class Sent(NamedTuple):

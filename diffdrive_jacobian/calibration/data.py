@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,19 +16,11 @@ from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bag_reader import (
     BagError,
-    ReadingInterruptedError,
-    messages,
     open_bag,
     recorded_parameters,
-    stored_connections,
 )
-from diffdrive_jacobian.bags.message_definitions import (
-    known_structure,
-    recorded_definition_differs,
-    type_hashes,
-)
+from diffdrive_jacobian.bags.decoded import read_messages
 from diffdrive_jacobian.calibration.model import CalibrationDrive
-from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import (
     FRAME,
     JOINT_STATE,
@@ -383,20 +375,31 @@ def read_wheels_and_reference(
             reader, reference, '--reference', 'ground_truth', tuple(POSES), any_name=True
         )
         joints, poses = JointRows(), PoseRows()
-        tally = _read(reader, {wheels_topic: joints, poses_topic: poses}, interrupted)
+        sinks: dict[str, JointRows | PoseRows] = {wheels_topic: joints, poses_topic: poses}
+        kinds: dict[str, Codec[Any]] = {JOINT_STATE.type_name: JOINT_STATE, **POSES}
+        codecs = {
+            one.id: kinds[one.msgtype]
+            for one in reader.connections
+            if one.topic in sinks and one.msgtype in kinds
+        }
+        tally = read_messages(
+            reader,
+            codecs,
+            lambda connection, received, value: sinks[connection.topic].add(received, value),
+            interrupted,
+        )
     where = printable(path, PATH_LIMIT)
     for topic, count in ((wheels_topic, joints.count), (poses_topic, poses.count)):
         if not count:
-            reasons = ', '.join(f'{number} {why}' for (on, why), number in tally.items() if on == topic)
+            found = [*tally.reasons[topic].items()]
+            found += [(MISSING, tally.missing[topic])] if tally.missing[topic] else []
+            reasons = ', '.join(f'{number} {why}' for why, number in found)
             colon = ': ' if reasons else ''
             raise BagError(f'{where} has no usable message on {topic}{colon}{reasons}')
     chosen = wheel_names(where, wheels_topic, joints.names, names, parameters)
     measured, from_speeds = joints.of(chosen, where, wheels_topic)
     poses.check(where, poses_topic)
-    notes = [
-        f'{count} messages on {printable(topic)} {why}{" and were skipped" * (why != MISSING)}'
-        for (topic, why), count in tally.items()
-    ]
+    notes = [*tally.notes()]
     observed = poses.samples()
     wheel_time, pose_time, note = common_clock(measured, observed, wheels_topic, poses_topic)
     notes += [note] if note else []
@@ -423,44 +426,3 @@ def read_wheels_and_reference(
         dimensions=dimensions_of(where, parameters),
         notes=tuple(notes),
     )
-
-
-def _read(
-    reader: Reader, sinks: dict[str, JointRows | PoseRows], interrupted: Callable[[], bool]
-) -> Counter[tuple[str, str]]:
-    """Read the messages of some topics; return how many were skipped, by topic and reason."""
-    tally: Counter[tuple[str, str]] = Counter()
-    invalid: Counter[str] = Counter()
-    codecs: dict[str, Codec[Any]] = {JOINT_STATE.type_name: JOINT_STATE, **POSES}
-    connections = [one for one in reader.connections if one.topic in sinks and one.msgtype in codecs]
-    readers = {
-        kind: codecs[kind].reader(known_structure(kind)) for kind in {one.msgtype for one in connections}
-    }
-    stored = stored_connections(reader)
-    foreign = {
-        one.id
-        for one in connections
-        if recorded_definition_differs(one.msgtype, type_hashes(one, stored))
-    }
-    found: Counter[str] = Counter()
-    for connection, received, data in messages(reader, connections, invalid):
-        if interrupted():
-            raise ReadingInterruptedError
-        topic = connection.topic
-        found[topic] += 1
-        if connection.id in foreign:
-            tally[topic, f'were recorded with another definition of {connection.msgtype}'] += 1
-            continue
-        try:
-            sinks[topic].add(received, readers[connection.msgtype](data))
-        except DecodingError:
-            tally[topic, 'cannot be decoded as little-endian CDR'] += 1
-        except MessageError:
-            tally[topic, 'hold invalid or implausible values'] += 1
-    for topic, count in invalid.items():
-        tally[topic, 'cannot be decoded'] += count
-    for topic in sinks:
-        expected = sum(one.msgcount for one in connections if one.topic == topic)
-        if (missing := expected - found[topic] - invalid[topic]) > 0:
-            tally[topic, MISSING] = missing
-    return tally

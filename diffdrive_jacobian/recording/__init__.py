@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 from diffdrive_jacobian import lazy
 
 if TYPE_CHECKING:
+    from diffdrive_jacobian.recording.progress import ReplayProgress
     from diffdrive_jacobian.recording.replaying import (
         COMMANDS,
         GOALS,
         NothingToPlayError,
         Playback,
         Replayer,
-        ReplayProgress,
         ReplayResult,
         describe_too_few,
         replay,
@@ -35,17 +35,5 @@ __all__ = [
 ]
 if not TYPE_CHECKING:
     # Whoever records does not need what replays.
-    __getattr__, __dir__ = lazy.attach(
-        __name__,
-        {
-            'COMMANDS': 'recording.replaying',
-            'GOALS': 'recording.replaying',
-            'NothingToPlayError': 'recording.replaying',
-            'Playback': 'recording.replaying',
-            'ReplayProgress': 'recording.replaying',
-            'ReplayResult': 'recording.replaying',
-            'Replayer': 'recording.replaying',
-            'describe_too_few': 'recording.replaying',
-            'replay': 'recording.replaying',
-        },
-    )
+    _MODULES = dict.fromkeys(__all__, 'recording.replaying') | {'ReplayProgress': 'recording.progress'}
+    __getattr__, __dir__ = lazy.attach(__name__, _MODULES)

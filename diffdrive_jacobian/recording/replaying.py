@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -32,6 +32,7 @@ from diffdrive_jacobian.bags.bag_reader import BagError, messages, open_bag
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, message_class
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.names import base_name, namespace_of, node_of
+from diffdrive_jacobian.recording.progress import ReplayProgress
 from diffdrive_jacobian.recording.qos import publisher_profile
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.rclpy_internals import RCLError, reason, restart_timer
@@ -399,44 +400,6 @@ class ReplayResult:
     """If the whole bag was played once: how many messages less than it counts were found in it."""
 
 
-class ReplayProgress(Protocol):
-    """Receives the progress of a replay, and pauses it."""
-
-    def waiting(self, reason: str) -> None:
-        """Receive what is waited for, many times a second."""
-
-    def started(self, seconds: float) -> None:
-        """Receive the length of what is played (s), once."""
-
-    def playing(self, seconds: float, *, paused: bool) -> None:
-        """Receive the position in it (s), many times a second."""
-
-    def toggled(self) -> bool:
-        """Return whether to pause, or to resume. It is called many times a second."""
-
-    def ended(self) -> None:
-        """Receive that playback has ended, if it started."""
-
-
-class _Silent:
-    """A progress that is not shown, of a replay that is not paused."""
-
-    def waiting(self, reason: str) -> None:
-        pass
-
-    def started(self, seconds: float) -> None:
-        pass
-
-    def playing(self, seconds: float, *, paused: bool) -> None:
-        pass
-
-    def toggled(self) -> bool:
-        return False
-
-    def ended(self) -> None:
-        pass
-
-
 def replay(
     bag: Path,
     playback: Playback | None = None,
@@ -469,7 +432,11 @@ def replay(
         BagError: The bag cannot be played, or not with these remappings.
         NothingToPlayError: It has no message to play.
     """
-    playback, signals, progress = playback or Playback(), signals or Signals(), progress or _Silent()
+    playback, signals, progress = (
+        playback or Playback(),
+        signals or Signals(),
+        progress or ReplayProgress(),
+    )
     with (
         open_bag(bag) as reader,
         fast_heartbeats(),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.recording.progress import ReplayProgress
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _output
 from diffdrive_jacobian.tools.entry_points import DONE, FAILED, INTERRUPTED, long_lived
@@ -78,7 +79,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     return _report(result, options)
 
 
-class _Progress:
+class _Progress(ReplayProgress):
     """Prints the progress of a replay, and pauses it by Enter."""
 
     def __init__(self) -> None:

@@ -82,6 +82,18 @@ def test_a_cut_at_any_byte_leaves_what_precedes_it_and_any_changed_byte_is_notic
             assert lost or left == messages
 
 
+def test_an_attachment_whose_checksum_is_erased_is_noticed(written):
+    data, _ = written([Text('parameters of /robot', '{}')])
+    ((_, end),) = [
+        (start, end) for opcode, start, end in mcap_records(data) if opcode == Opcode.ATTACHMENT
+    ]
+    lost = []
+    erased = data[: end - 4] + bytes(4) + data[end:]
+    found = list(read_mcap(BytesIO(erased), lost.append, lambda doubt: None))
+    assert not any(isinstance(one, Text) for one in found)
+    assert 'is damaged: it is left out' in lost[0]
+
+
 def test_a_chunk_that_is_missing_is_noticed(written):
     a, b, c, d = (Message(number % 3, number, bytes(number)) for number in range(1, 5))
     whole, sizes = written([a], [b, c], [d])

@@ -216,7 +216,8 @@ def test_parameters_are_those_of_the_beginning_and_changes_come_after(tmp_path):
     # Of several none is meant, but the names of the wheels are the same.
     assert run.of_node('wheel_bridge') == {}
     assert run.wheels.values.tolist() == [[2.0, 1.0]]
-    assert run.parameter_events == ((2 * SECOND, '/go_to_goal', {'kp': 6.0}),)
+    ((received, change),) = run.parameter_events
+    assert (received, change.node, change.values) == (2 * SECOND, '/go_to_goal', {'kp': 6.0})
 
 
 # --- What follows of a run

@@ -16,6 +16,7 @@ from diffdrive_jacobian.drives import drive
 from diffdrive_jacobian.live.bag_player import BagPlayer, RecordedRobot, read_robots
 from diffdrive_jacobian.live.commands import CancelGoal, Pause, Seek, SetSpeed, Step
 from diffdrive_jacobian.live.session import Session
+from diffdrive_jacobian.messages.codecs import Changes
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.recording.recording import Recording
 
@@ -146,7 +147,7 @@ def test_gains_of_another_package_are_shown_as_recorded(bag, robots):
 def test_the_page_follows_changes_of_the_controller_and_nothing_can_be_steered(bag, robots):
     (robot,) = robots
     received = int(robot.run.odometry.received[20])
-    change = (received, '/go_to_goal', {'use_goal_heading': True})
+    change = (received, Changes('/go_to_goal', {'use_goal_heading': True}, received))
     player = Player(
         bag, [RecordedRobot('/', replace(robot.run, parameter_events=(change,)), robot.start)]
     )

@@ -14,6 +14,7 @@ from support.recorded import recorded
 from support.ros_messages import instants, placement, pose_of, twist
 
 from diffdrive_jacobian.bags.verification import COVARIANCE_TOLERANCE, verify
+from diffdrive_jacobian.messages.codecs import Changes
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
@@ -189,7 +190,8 @@ def test_a_changed_ground_truth_and_another_seed_are_found(run):
 
 def test_without_the_dimensions_of_the_robot_the_odometry_alone_is_verified(run):
     (name,) = run.parameters
-    changed = (run.odometry.received[50], name, {'left_wheel_radius_multiplier': 1.1})
+    at = run.odometry.received[50]
+    changed = (at, Changes(name, {'left_wheel_radius_multiplier': 1.1}, at))
     for unknown in ({'parameters': {}}, {'parameter_events': (changed,)}):
         verification = verify(replace(run, **unknown))
         assert verification.truth is None

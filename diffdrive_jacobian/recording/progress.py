@@ -1,0 +1,23 @@
+"""Progress of a replay. Imports no ROS: a tool that has to start fast shows it."""
+
+from __future__ import annotations
+
+
+class ReplayProgress:
+    """Receives the progress of a replay, and pauses it. This one shows nothing and does not pause."""
+
+    def waiting(self, reason: str) -> None:
+        """Receive what is waited for, many times a second."""
+
+    def started(self, seconds: float) -> None:
+        """Receive the length of what is played (s), once."""
+
+    def playing(self, seconds: float, *, paused: bool) -> None:
+        """Receive the position in it (s), many times a second."""
+
+    def toggled(self) -> bool:
+        """Return whether to pause, or to resume. It is called many times a second."""
+        return False
+
+    def ended(self) -> None:
+        """Receive that playback has ended, if it started."""
