@@ -118,13 +118,19 @@ def _nearest(events: list[Event], odometry: Series, index: int) -> Robot | None:
     last = bisect_right(events, stamp, key=lambda event: event.robot.stamp) - 1
     if last < 0:
         return None
-    robot = events[last].robot.at(stamp)
+    latest = events[last].robot
+    robot = latest.at(stamp)
+    candidates = [robot]
     # The first one is the start of the robot, the others are in the order of their recording.
     known = bisect_left(events, received, 1, last + 1, key=lambda event: event.received) - 1
-    if known == last:
+    if known < last:
+        earlier = range(max(known, last + 1 - _MAX_CANDIDATES), last)
+        candidates += [events[one].robot.at(stamp) for one in earlier]
+    if robot.model.takes_time and robot.twist != tuple(odometry.values[index, 3:5]):
+        # At the very time of a jump, the last bit of a time decides which speed is reported.
+        candidates += [latest.at(one) for one in (stamp - 1, stamp + 1) if one >= latest.stamp]
+    if len(candidates) == 1:
         return robot
-    earlier = range(max(known, last + 1 - _MAX_CANDIDATES), last)
-    candidates = [robot, *(events[one].robot.at(stamp) for one in earlier)]
 
     def apart(candidate: Robot) -> float:
         state = np.array([*candidate.pose_tuple, *candidate.twist])
