@@ -33,6 +33,8 @@ from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.time_units import NANOSECONDS
 
+FIRST = NANOSECONDS // 2
+"""Within this time after its start a robot that stands has not been driven elsewhere (ns)."""
 _MAX_CANDIDATES = 32
 """Largest number of commands among which the last one that preceded an odometry message is sought."""
 _NEVER = int(np.iinfo(np.int64).max)
@@ -174,8 +176,9 @@ def _applied(run: Run) -> Driven:
             robot = robot.commanded(tuple(row.values.tolist()), row.stamp)
         else:
             pose, covariance = row.values[:3], row.values[3:].reshape(3, 3)
-            if row.stamp < robot.stamp:
-                epochs.append([])
+            back = row.stamp < robot.stamp
+            if back or _restarted(run, robot, row.stamp):
+                epochs += [[]] if back else []
                 robot = Robot(model=model, stamp=row.stamp, pose=pose, covariance=covariance)
             else:
                 moved = robot.placed(pose, covariance, row.stamp)
@@ -236,13 +239,29 @@ def _moving(run: Run, index: int) -> Robot:
 
 
 def _following(robot: Robot, run: Run, dynamics: list[RobotModel]) -> Robot:
-    """Let a robot follow the last command that was given before, and that acts already."""
-    last = int(np.searchsorted(run.cmd_vel_out.stamps, robot.stamp, side='right'))
-    model = dynamics[last]
-    at_once = replace(model, actuators=replace(model.actuators, delay=0))
-    v, omega = run.cmd_vel_out.values[last - 1].tolist()
-    follows = robot.remodelled(at_once, robot.stamp).commanded((v, omega), robot.stamp)
-    return follows.remodelled(model, robot.stamp)
+    """Let a robot follow the last command that acts already, and then those that were given later."""
+    stamps, now = run.cmd_vel_out.stamps, robot.stamp
+    given = int(np.searchsorted(stamps, now, side='right'))
+    model = dynamics[given]
+    delay = model.actuators.delay
+    acting = int(np.searchsorted(stamps, now - delay, side='right'))
+    for number in range(acting - 1, given):
+        left = max(int(stamps[number]) + delay - now, 0)
+        robot = robot.remodelled(replace(model, actuators=replace(model.actuators, delay=left)), now)
+        v, omega = run.cmd_vel_out.values[number].tolist()
+        robot = robot.commanded((v, omega), now)
+    return robot.remodelled(model, now)
+
+
+def _restarted(run: Run, robot: Robot, stamp: int) -> bool:
+    """Return whether a start is that of a new process: the robot stands although it was commanded."""
+    odometry = run.odometry
+    first = int(np.argmax(odometry.stamps >= stamp))
+    now = int(odometry.stamps[first])
+    commands = run.cmd_vel_out.stamps
+    if now < stamp or ((commands >= stamp) & (commands <= now)).any():
+        return False
+    return not odometry.values[first, 3:5].any() and robot.at(now).twist != (0.0, 0.0)
 
 
 def _placed_as_recorded(run: Run, moved: Robot, reset: Robot) -> Robot:
@@ -292,7 +311,7 @@ def _rests(run: Run, delay: int) -> bool:
 def _settled_since(run: Run, dynamics: list[RobotModel]) -> int:
     """Return the odometry message from which on the state of a robot that takes time is known.
 
-    That needs the commands of one delay. Behind the limits of the acceleration, a lag hides where these
+    That needs all commands that may act. Behind the limits of the acceleration, a lag hides where these
     are: the twist must have settled, too.
 
     Raises:
@@ -301,15 +320,10 @@ def _settled_since(run: Run, dynamics: list[RobotModel]) -> int:
     commands, odometry = run.cmd_vel_out.stamps, run.odometry
     changes: NDArray[np.bool_] = np.any(np.diff(odometry.values[:, 3:5], axis=0, prepend=np.nan), axis=1)
     for index, stamp in enumerate(odometry.stamps.tolist()):
-        last = int(np.searchsorted(commands, stamp, side='right'))
-        if not last:
-            continue
-        actuators = dynamics[last].actuators
-        # At the very time the message may be from before the command.
-        since = stamp - max(commands[0], commands[last - 1])
-        known = since > actuators.delay
+        actuators = dynamics[int(np.searchsorted(commands, stamp, side='right'))].actuators
         hidden = actuators.lag > 0.0 and not actuators.acceleration.unlimited
-        if known and not (hidden and changes[index]):
+        # At the very time the message may be from before the command.
+        if stamp - commands[0] > actuators.delay and not (hidden and changes[index]):
             return index
     lacking = 'commands' if len(run.start_pose) else 'start_pose'
     raise BagError(
@@ -334,21 +348,25 @@ def _starts_before_recording(run: Run) -> int:
 
 
 def _stood_since(run: Run, index: int) -> bool:
-    """Return whether the first odometry is still that of a `start_pose`: nothing has moved since.
+    """Return whether the robot still stands at a `start_pose` in the first odometry.
 
-    In a process that creates its nodes before it spins them, the first odometry follows late.
+    In a process that creates its nodes before it spins them, the first odometry follows late. After more
+    than `FIRST` it must be that of the start: the robot may have been driven elsewhere meanwhile.
     """
     start, first, truth = run.start_pose, run.odometry.values[0], run.ground_truth
+    # Commands that were recorded before it could not be applied to it.
+    if first[3:5].any() or (run.cmd_vel_out.received < start.received[index]).any():
+        return False
+    # Not after a reset of the odometry alone.
+    if len(truth) and not np.array_equal(truth.values[0, :3], start.values[index]):
+        return False
+    if run.odometry.stamps[0] - start.stamps[index] <= FIRST:
+        return True
     covariances = run.odometry_covariances
     if len(covariances) != len(run.odometry) or len(run.start_covariances) != len(start):
         return False
     return bool(
-        # Commands that were recorded before it could not be applied to it.
-        not (run.cmd_vel_out.received < start.received[index]).any()
-        and not first[3:5].any()
-        and np.array_equal(first[:3], start.values[index])
-        # Not after a reset of the odometry alone.
-        and (not len(truth) or np.array_equal(truth.values[0, :3], start.values[index]))
+        np.array_equal(first[:3], start.values[index])
         and np.array_equal(covariances[0, :6], run.start_covariances[index])
     )
 
@@ -379,13 +397,15 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> Driven:
         for received, change in run.parameter_events
         if base_name(change.node) == ROBOT
     ]
-    rows.sort(key=lambda row: row[0])
     before = max(int(np.searchsorted(run.odometry.stamps, int(series.received[0]))) - 1, 0)
-    robot = Robot(
-        model=parameters.model(),
-        stamp=int(run.odometry.stamps[before]),
-        pose=run.odometry.values[before, :3].copy(),
-    )
+    robot = _moving(run, before)
+    robot = robot.remodelled(parameters.model(), robot.stamp)
+    rows += [
+        (stamp, pose)
+        for stamp, pose in zip(run.start_pose.stamps.tolist(), run.start_pose.values, strict=True)
+        if stamp > robot.stamp
+    ]
+    rows.sort(key=lambda row: row[0])
     events = [Event(robot, int(run.odometry.received[before]))]
     wheels = source == 'joint_command'
     for received, row in rows:
@@ -395,6 +415,8 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> Driven:
             values.update(row)
             parameters = VirtualRobotParameters().changed(values)
             robot = robot.remodelled(parameters.model(), received, wheels_commanded=wheels)
+        elif len(row) == 3:
+            robot = robot.placed(row, np.zeros((3, 3)), received)
         else:
             try:
                 first, second = row.tolist()
@@ -403,5 +425,5 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> Driven:
                 # The node drops it as well.
                 continue
             robot = robot.commanded(twist, received)
-        events.append(Event(robot, received, is_command=not isinstance(row, dict)))
+        events.append(Event(robot, received, is_command=not isinstance(row, dict) and len(row) == 2))
     return Driven(source=source, start='odometry', epochs=[events])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.bag_reader import BagError
 from diffdrive_jacobian.bags.driven_again import Driven, driven_again, robots_at_odometry
-from diffdrive_jacobian.bags.recorded_robot import ROBOT, recorded_model
+from diffdrive_jacobian.bags.recorded_robot import MARGIN, ROBOT, recorded_model
 from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.messages.names import base_name
 from diffdrive_jacobian.numerics.elementary import wrap
@@ -224,11 +224,16 @@ def _missing(run: Run) -> Iterator[str]:
     for name, series in together.items():
         if not len(series) or name in lost:
             continue
-        others = [one.stamps for other, one in together.items() if other not in lost | {name}]
-        stamps = np.setdiff1d(np.concatenate(others), series.stamps)
-        # A recorder discovers topics one after the other, and odometry comes first in the end.
-        end = math.inf if name == 'odom' else series.stamps.max()
-        gaps = stamps[(stamps > series.stamps.min()) & (stamps < end)]
+        others = np.concatenate(
+            [o.stamps for other, o in together.items() if other not in lost | {name}]
+        )
+        stamps = np.setdiff1d(others, series.stamps)
+        begins, ends = series.stamps.min(), others.max(initial=0)
+        # Of the last time a recording may have the first message only, which is that of the odometry.
+        gaps = stamps[(stamps > begins) & ((stamps < ends) | (name == 'odom'))]
+        # A recorder finds topics one after the other, but within a second.
+        if len(stamps) and stamps.min() < begins - MARGIN:
+            gaps = np.union1d(stamps[stamps < begins], gaps)
         if len(gaps):
             when = [f'{seconds(stamp - run.odometry.stamps[0]):.3f} s' for stamp in gaps.tolist()]
             more = f' and {len(when) - _MAX_NAMED} more' if len(when) > _MAX_NAMED else ''
@@ -263,15 +268,21 @@ def _notes(run: Run, driven: Driven, found: Verification) -> Iterator[str]:
             'ground_truth was not compared: it needs the parameters of virtual_robot, cmd_vel_out and '
             'the first start_pose'
         )
+    robot = run.of_node(ROBOT)
+    if exact and robot and found.covariance_difference is None:
+        yield (
+            'the covariances were not compared: they need the first start_pose, and valid parameters of '
+            'virtual_robot that do not change its wheels'
+        )
     if not exact or found.agrees(EXACT, EXACT):
         return
-    if not run.of_node(ROBOT):
+    if not robot:
         yield (
             'the parameters of virtual_robot were not recorded: the motion of a robot with limits of '
             'the acceleration, a lag or a delay cannot be reproduced without them'
         )
-    elif not run.fault_events:
+    elif not run.parameter_events or not run.fault_events:
         yield (
-            'no faults are recorded: if this was a lockstep world with a fault of the motors, record '
-            '/fault_events'
+            'changes of parameters and faults of the motors are known only if /parameter_events and, of '
+            'a lockstep world, /fault_events are recorded'
         )

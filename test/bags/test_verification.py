@@ -232,7 +232,7 @@ def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, driven, limit
     assert verify(replace(run, fault_events=of_another)).distances.max() > 0.01
     without = verify(replace(run, fault_events=()))
     assert without.distances.max() > 0.01
-    assert 'record /fault_events' in without.notes[-1]
+    assert '/fault_events are recorded' in without.notes[-1]
 
 
 def test_time_that_goes_back_is_followed(robot_at, driven):
@@ -395,6 +395,77 @@ def test_messages_that_were_skipped_or_lost_are_missing(run):
         assert re.match(r'[12] messages on /(odom|cmd_vel_out)', missing)
     # The goals do not matter.
     held(replace(run, skipped={'/goals': 1}))
+
+
+def test_many_messages_that_are_missing_at_the_beginning_or_the_end_are_named(run):
+    for name, kept in (
+        ('odometry', slice(60, None)),
+        ('wheels', slice(0, 40)),
+        ('wheels', slice(60, None)),
+    ):
+        changes = {name: rows(getattr(run, name), kept)}
+        covariances = run.odometry_covariances[kept if name == 'odometry' else slice(None)]
+        topic = 'odom' if name == 'odometry' else 'joint_states'
+        (missing,) = verify(replace(run, **changes, odometry_covariances=covariances)).missing
+        assert re.match(rf'{topic} at .* and \d\d more, when', missing)
+
+
+@pytest.mark.parametrize('what', ['start', 'odometry', 'covariance', 'covariances'])
+def test_a_start_that_does_not_fit_the_odometry_is_a_difference(lockstep, robot_at, tmp_path, what):
+    """Although the first odometry comes as late as in a process that has just started."""
+    robot_at(x=0.3)
+    lockstep.run_for(0.2)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        lockstep.run_for(0.1)
+        lockstep.publish('cmd_vel', twist(0.1, 0.9))
+        lockstep.run_for(0.4)
+    run = made.run
+    assert held(run).start == 'start_pose'
+    moved = run.odometry.values + np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+    wider = run.start_covariances + np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
+    changes = {
+        'start': {'start_pose': replace(run.start_pose, values=run.start_pose.values + 1.0)},
+        'odometry': {'odometry': replace(run.odometry, values=moved)},
+        'covariance': {'start_covariances': wider},
+        'covariances': {'odometry_covariances': np.full_like(run.odometry_covariances, 7.0)},
+    }
+    assert not verify(replace(run, **changes[what])).agrees(EXACT, EXACT)
+
+
+@pytest.mark.parametrize('limits', [{}, {'linear__x__max_acceleration': 0.5}, {'simulate_slip': True}])
+def test_a_robot_that_is_started_again_while_it_moves_is_followed(lockstep, robot_at, tmp_path, limits):
+    robot = robot_at(**limits)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        made.look()
+        lockstep.publish('cmd_vel', twist(0.3, 0.7))
+        lockstep.run_for(0.5)
+        lockstep.remove(robot)
+        lockstep.run_for(0.1)
+        robot_at(**limits)
+        made.look()
+        lockstep.run_for(0.2)
+        lockstep.publish('cmd_vel', twist(-0.2, 0.7))
+        lockstep.run_for(0.3)
+    assert len(made.run.start_pose) == 2
+    held(made.run)
+
+
+def test_placements_are_followed_by_the_time_of_recording(robot_at, lockstep, tmp_path):
+    robot_at()
+    with recorded(lockstep, tmp_path / 'run') as made:
+        lockstep.publish('cmd_vel', twist(0.0, 0.0))
+        made.look()
+        lockstep.publish('cmd_vel', twist(0.3, 0.7))
+        lockstep.run_for(0.3)
+        lockstep.publish('initialpose', PoseWithCovarianceStamped())
+        lockstep.run_for(0.1)
+        lockstep.publish('cmd_vel', twist(0.3, 0.7))
+        lockstep.run_for(0.2)
+    run = replace(made.run, cmd_vel_out=rows(made.run.cmd_vel_out, NOTHING))
+    held(run, 0.02)
+    # Of a robot that moves already.
+    late = rows(run.odometry, slice(4, None))
+    held(replace(run, odometry=late, cmd_vel=rows(run.cmd_vel, slice(1, None))), 0.02)
 
 
 def test_what_a_fault_loses_is_not_missing(lockstep, robot_at, driven):
