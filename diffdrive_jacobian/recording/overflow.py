@@ -1,4 +1,4 @@
-"""When the buffers through which this process receives may have overflowed.
+"""When messages may have been dropped: a buffer overflowed, or this process was held.
 
 Through UDP, as the programs of this package receive, the kernel counts for each socket the datagrams
 that it dropped because the buffer was full (SO_MEMINFO, Linux). Fast DDS sends them again, unless the
@@ -24,7 +24,9 @@ _SO_MEMINFO = 55
 _MEMINFO = struct.Struct('9I')
 """Nine counters, the last of which is that of drops (linux/sock_diag.h)."""
 _SPACING = NANOSECONDS // 1000
-"""Least time between every second entry in the history (ns)."""
+"""Within this time two entries are kept (ns)."""
+HELD = 7 * NANOSECONDS // 20
+"""Time between two looks after which the process was held: there are five in a second (ns)."""
 BURST_VOLUME = 80_000
 """Volume with which a buffer may have overflowed that nobody counts (bytes; a socket has 212,992)."""
 BURST_TIME = NANOSECONDS // 20
@@ -33,8 +35,26 @@ OVERHEAD = 768
 """What a message takes up in a buffer besides its data (bytes)."""
 
 
+class _Times:
+    """Times in ascending order (ns); of many within `_SPACING` the first and the last one."""
+
+    def __init__(self) -> None:
+        self.times = array('q')
+
+    def add(self, stamp: int) -> None:
+        times = self.times
+        if len(times) > 1 and stamp - times[-2] < _SPACING:
+            times[-1] = stamp
+        else:
+            times.append(stamp)
+
+    def within(self, begin: int, end: int) -> bool:
+        first = bisect_left(self.times, begin)
+        return first < len(self.times) and self.times[first] <= end
+
+
 class Overflow:
-    """The times at which datagrams were dropped, by the clock of this machine (ns since the epoch)."""
+    """When messages may have been dropped, by the clock of this machine (ns since the epoch)."""
 
     def __init__(self, *, counted: bool) -> None:
         """Find the sockets of this process.
@@ -44,18 +64,25 @@ class Overflow:
         """
         self._sockets = _user_sockets() if counted else []
         self._dropped = self._count()
+        self._looked = time.time_ns()
         self._window = self._volume = 0
-        self._times = array('q')
+        self._drops, self._holds = _Times(), _Times()
 
     @property
     def last(self) -> int:
-        """The latest of these times; 0: nothing was dropped."""
-        return self._times[-1] if self._times else 0
+        """When datagrams were dropped last; 0: never."""
+        return self._drops.times[-1] if self._drops.times else 0
 
-    def within(self, begin: int, end: int) -> bool:
+    def dropped(self, begin: int, end: int) -> bool:
         """Return whether datagrams may have been dropped between two times (ns)."""
-        first = bisect_left(self._times, begin)
-        return first < len(self._times) and self._times[first] <= end
+        return self._drops.within(begin, end)
+
+    def held(self, begin: int, end: int) -> bool:
+        """Return whether this process was held between two times (ns).
+
+        What waits in a buffer when a publisher ends is dropped by Fast DDS if it hears of the end first.
+        """
+        return self._holds.within(begin, end)
 
     def close(self) -> None:
         """Let go of the sockets."""
@@ -64,11 +91,14 @@ class Overflow:
         self._dropped = 0
 
     def look(self) -> None:
-        """Note whether datagrams were dropped since the last call."""
-        dropped = self._count()
+        """Note whether datagrams were dropped since the last call, or the process was held meanwhile."""
+        dropped, before, now = self._count(), self._looked, time.time_ns()
         if dropped != self._dropped:
-            self._dropped = dropped
-            self._note(time.time_ns())
+            self._drops.add(now)
+        if now - before > HELD:
+            self._holds.add(before)
+            self._holds.add(now)
+        self._dropped, self._looked = dropped, now
 
     def received(self, size: int, stamp: int) -> None:
         """Take account of a message of a size (bytes) that was received at a time (ns)."""
@@ -79,14 +109,7 @@ class Overflow:
             self._window, self._volume = stamp, 0
         self._volume += size + OVERHEAD
         if self._volume > BURST_VOLUME:
-            self._note(stamp)
-
-    def _note(self, stamp: int) -> None:
-        times = self._times
-        if len(times) > 1 and stamp - times[-2] < _SPACING:
-            times[-1] = stamp
-        else:
-            times.append(stamp)
+            self._drops.add(stamp)
 
     def _count(self) -> int:
         counters = (

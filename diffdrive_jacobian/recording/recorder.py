@@ -178,8 +178,8 @@ class Recorder(Node):  # type: ignore[misc]
         if now - self._last_added > IN_TRANSIT:
             self.awaited = self._awaited()
             if not self.awaited:
-                for topic in self._in_doubt():
-                    self._leave_out_end(topic, 'a buffer overflowed, and then its publisher was silent')
+                for topic, why in self._in_doubt().items():
+                    self._leave_out_end(topic, why)
                 return True
         if now > self._drain_deadline:
             self.give_up(f'messages were still arriving {DRAIN_PATIENCE:.0f} s after the end')
@@ -194,18 +194,18 @@ class Recorder(Node):  # type: ignore[misc]
     def _leave_out_end(self, topic: str, why: str) -> None:
         self._sink.set_left_out(f'possibly the end of {topic}', why)
 
-    def _in_doubt(self) -> dict[str, set[bytes]]:
-        """Return the reliable publishers of which the last messages may have been dropped, by topic."""
-        doubtful = {
-            topic: {
-                publisher
-                for publisher, last in reception.last.items()
-                if publisher not in reception.confirmed
-                and self._overflow.within(last, last + int(ACTIVE * NANOSECONDS))
-            }
-            for topic, reception in self._receptions.items()
-        }
-        return {topic: publishers for topic, publishers in doubtful.items() if publishers}
+    def _in_doubt(self) -> dict[str, str]:
+        """Return the topics of which a reliable publisher's last messages may be missing, and why."""
+        found = {}
+        for topic, reception in self._receptions.items():
+            for publisher in reception.last.keys() - reception.confirmed:
+                last = reception.last[publisher]
+                moment = last, last + int(ACTIVE * NANOSECONDS)
+                if self._overflow.dropped(*moment):
+                    found[topic] = 'a buffer overflowed, and then its publisher was silent'
+                elif self._overflow.held(*moment) and publisher not in self._publishers_of(topic):
+                    found[topic] = 'its publisher ended while this process was held'
+        return found
 
     def _awaited(self) -> list[str]:
         """Return the topics of which dropped messages may still be sent again."""
@@ -213,11 +213,14 @@ class Recorder(Node):  # type: ignore[misc]
             return []
         return [
             topic
-            for topic, publishers in self._in_doubt().items()
-            if any(
-                bytes(one.endpoint_gid) in publishers for one in self.get_publishers_info_by_topic(topic)
-            )
+            for topic in self._in_doubt()
+            if self._publishers_of(topic)
+            & self._receptions[topic].last.keys() - self._receptions[topic].confirmed
         ]
+
+    def _publishers_of(self, topic: str) -> set[bytes]:
+        """Return the publishers of a topic that have not ended, as far as that is known."""
+        return {bytes(one.endpoint_gid) for one in self.get_publishers_info_by_topic(topic)}
 
     def _report_missed(self) -> None:
         for topic, reception in self._receptions.items():
@@ -430,7 +433,10 @@ def _drain(
     """Receive what was sent before now, until a further signal."""
     recorder.end()
     before = signals.count
-    drained = runner.spin(recorder.drained, timeout=WAIT_SHOWN, signals=signals, handled=before)
+    # Until nothing is in transit any more, a second signal changes nothing.
+    drained = runner.spin(recorder.drained, timeout=2.0 * IN_TRANSIT)
+    if not drained:
+        drained = runner.spin(recorder.drained, timeout=WAIT_SHOWN, signals=signals, handled=before)
     if not drained:
         if recorder.awaited and signals.count == before:
             on_wait(recorder.awaited)

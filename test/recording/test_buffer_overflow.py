@@ -43,9 +43,9 @@ def test_the_kernel_counts_what_it_drops(receiver):
     begun = overflow.time.time_ns()
     flood(receiver)
     watched.received(10**9, begun)
-    assert watched.within(begun, begun + 10**10)
-    assert not watched.within(watched.last + 1, watched.last + 10**10)
-    assert not watched.within(begun - 10**10, begun)
+    assert watched.dropped(begun, begun + 10**10)
+    assert not watched.dropped(watched.last + 1, watched.last + 10**10)
+    assert not watched.dropped(begun - 10**10, begun)
     watched.close()
     watched.look()
     assert watched.last < overflow.time.time_ns()
@@ -64,8 +64,25 @@ def test_where_nobody_counts_a_burst_is_an_overflow(receiver):
     assert watched.last == 1000 * MILLISECOND + 3
 
 
+def test_a_process_that_was_held_may_have_missed_something(monkeypatch):
+    now = 10**18
+    monkeypatch.setattr(overflow.time, 'time_ns', lambda: now)
+    watched = Overflow(counted=True)
+    for step in (1, 200, 300):
+        now += step * MILLISECOND
+        watched.look()
+    assert not watched.held(0, now)
+    before = now
+    now += 400 * MILLISECOND
+    watched.look()
+    assert watched.held(before, before)
+    assert watched.held(now, now)
+    assert not watched.held(now + 1, now + 10**10)
+    assert watched.last == 0
+
+
 def test_the_history_is_bounded_in_its_rate():
     watched = Overflow(counted=False)
     for number in range(1000):
         watched.received(2 * overflow.BURST_VOLUME, number * MILLISECOND // 100)
-    assert len(watched._times) <= 21
+    assert len(watched._drops.times) <= 21
