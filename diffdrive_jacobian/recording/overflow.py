@@ -62,7 +62,7 @@ class Overflow:
         Args:
             counted: Whether all that is received comes through UDP, so that the kernel counts.
         """
-        self._sockets = _user_sockets() if counted else []
+        self._sockets = _udp_sockets() if counted else []
         self._dropped = self._count()
         self._looked = time.time_ns()
         self._window = self._volume = 0
@@ -118,11 +118,8 @@ class Overflow:
         return sum(_MEMINFO.unpack(one)[-1] for one in counters)
 
 
-def _user_sockets() -> list[socket.socket]:
-    """Return the UDP sockets of this process that receive messages; []: that is not known.
-
-    RTPS (9.6.1) gives messages odd ports, and discovery even ones.
-    """
+def _udp_sockets() -> list[socket.socket]:
+    """Return the UDP sockets of this process; []: they are not known."""
     found: list[socket.socket] = []
     if not sys.platform.startswith('linux'):
         return found
@@ -133,10 +130,8 @@ def _user_sockets() -> list[socket.socket]:
                 continue
             one = socket.socket(fileno=os.dup(int(name)))
             if one.type == socket.SOCK_DGRAM and one.family == socket.AF_INET:
-                port = one.getsockname()[1]
-                if port % 2:
-                    one.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
-                    found.append(one)
-                    continue
-            one.close()
+                one.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+                found.append(one)
+            else:
+                one.close()
     return found

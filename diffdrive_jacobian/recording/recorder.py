@@ -47,7 +47,7 @@ DEPTH = 4000
 DRAIN_PATIENCE = 12.0
 """Longest time at the end in which messages that were sent before are received (s)."""
 IN_TRANSIT = 0.1
-"""After this time without such a message no more is expected, unless there was a burst (s)."""
+"""After this time without such a message no more is expected, unless a buffer overflowed (s)."""
 HEARTBEAT = 3.5
 """Time after an overflow in which reliable publishers send what was lost in it (s).
 
@@ -94,7 +94,7 @@ class Recorder(Node):  # type: ignore[misc]
             ParameterError: The name of a topic is invalid.
         """
         super().__init__(NAME, start_parameter_services=False, **kwargs)
-        self._overflow = Overflow(counted=receives_through_udp())
+        self._overflow = Overflow(counted=with_info and receives_through_udp())
         self._sink = sink
         self._everything = selection.everything
         self._names = {self._resolved(topic) for topic in selection.topics}

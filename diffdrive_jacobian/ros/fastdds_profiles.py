@@ -14,6 +14,10 @@ A reliable writer of Fast DDS sends its readers a heartbeat every 3 s. A reader 
 messages acknowledges them only in reply to a heartbeat. `Publisher.wait_for_all_acked` therefore takes
 up to 3 s after the messages were received, unless heartbeats are more frequent.
 
+Messages and discovery have a port each, and a thread. So the end of a publisher may be heard before the
+last message that it sent, which is then dropped. A recorder receives both through one port, in order
+(`offsetd3` is that of the port for discovery).
+
 Fast DDS reads the file that an environment variable names, when the first participant of a process is
 created. A choice of the user is left as it is: a file of profiles in the environment or in the working
 directory, transports without UDP over IPv4, a discovery server, or another middleware.
@@ -34,6 +38,7 @@ _FILES = {
     os.path.join(_FOLDER, 'announcements.xml'): {'announcements'},
     os.path.join(_FOLDER, 'heartbeats.xml'): {'heartbeats'},
     os.path.join(_FOLDER, 'announcements_heartbeats.xml'): {'announcements', 'heartbeats'},
+    os.path.join(_FOLDER, 'recorder.xml'): {'announcements', 'heartbeats', 'order'},
 }
 """The files, and the profiles in each."""
 # Other names of the variable, how Fast DDS is told to ignore files, and servers, which replace
@@ -72,6 +77,13 @@ def open_to_others() -> None:
     """Do what `announce_frequently` does, and send heartbeats every 0.1 s."""
     if announce_frequently():
         _use('heartbeats')
+
+
+def receive_in_order() -> None:
+    """Do what `open_to_others` does, and hear of the end of a publisher after its last message."""
+    open_to_others()
+    if _own() == {'announcements', 'heartbeats'}:
+        _use('order')
 
 
 def for_other_process() -> dict[str, str]:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 
-from diffdrive_jacobian.ros.fastdds_profiles import open_to_others
+from diffdrive_jacobian.ros.fastdds_profiles import open_to_others, receive_in_order
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import how_to_get_ros
 
@@ -86,7 +86,7 @@ def _run(program: str) -> int:
             for replaced in (name, f'__{name}__'):
                 setattr(sys, replaced, open(os.devnull, 'w'))  # noqa: SIM115
     # What is published last is acknowledged before the process ends.
-    open_to_others()
+    receive_in_order() if program == 'record_run' else open_to_others()
     # A message class imports this package for one function. It does without the generator and the parser
     # of definitions, which take longer than to create a node, where they cannot be imported.
     if 'rosidl_generator_py' not in sys.modules:

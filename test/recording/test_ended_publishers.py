@@ -60,6 +60,39 @@ def test_one_that_overflows_the_buffer_is_not_called_complete(recorded, number):
     assert count == 10 or (code == 1 and 'possibly the end of /said' in said), said
 
 
+SEVERAL = """
+import time
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from std_msgs.msg import String
+
+for number in range(10):
+    context = Context()
+    rclpy.init(context=context)
+    node = Node('ends', context=context)
+    publisher = node.create_publisher(String, 'said', 10)
+    while not publisher.get_subscription_count():
+        time.sleep(0.02)
+    time.sleep(0.2)
+    for _ in range(5):
+        time.sleep(0.01)
+        publisher.publish(String(data='x' * 300))
+    node.destroy_node()
+    context.shutdown()
+"""
+
+
+def test_the_last_message_is_read_before_the_end_of_its_publisher_is_heard(world, tmp_path):
+    """Through a port of its own, discovery was faster in one of six."""
+    child = world.start('record_run', '/said', '-o', str(tmp_path / 'run'))
+    child.until_says('recording to')
+    assert forked.run(SEVERAL, timeout=60).returncode == 0
+    child.signal(signal.SIGINT)
+    assert child.exit() == 0
+    assert len(read_bag(tmp_path / 'run')) == 50
+
+
 NODE = """
 import sys, time
 from rclpy.node import Node

@@ -20,6 +20,7 @@ from diffdrive_jacobian.ros.fastdds_profiles import (
     VARIABLE,
     announce_frequently,
     fast_heartbeats,
+    receive_in_order,
     withdraw,
 )
 from diffdrive_jacobian.ros.runner import ros_context, running
@@ -120,6 +121,17 @@ def test_heartbeats_are_added_to_announcements(announced):
         assert re.search(r'<heartbeatPeriod><sec>0</sec><nanosec>100000000</nanosec>', profile())
         assert ('leaseAnnouncement' in profile()) == announced
     assert VARIABLE not in os.environ
+
+
+def test_a_recorder_has_one_port_for_messages_and_discovery(monkeypatch):
+    receive_in_order()
+    assert re.search(r'<offsetd3>10</offsetd3>', profile())
+    for part in ('leaseAnnouncement', 'heartbeatPeriod', '<udpv4/>'):
+        assert part in profile()
+    withdraw()
+    monkeypatch.setenv(SWITCH, '0')
+    receive_in_order()
+    assert 'offsetd3' not in profile()
 
 
 @pytest.mark.parametrize('choice', CHOICES.values(), ids=CHOICES)
