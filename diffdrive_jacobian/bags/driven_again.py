@@ -177,7 +177,7 @@ def _applied(run: Run) -> Driven:
         else:
             pose, covariance = row.values[:3], row.values[3:].reshape(3, 3)
             back = row.stamp < robot.stamp
-            if back or _restarted(run, robot, row.stamp):
+            if back or _restarted(run, robot, row):
                 epochs += [[]] if back else []
                 robot = Robot(model=model, stamp=row.stamp, pose=pose, covariance=covariance)
             else:
@@ -253,13 +253,16 @@ def _following(robot: Robot, run: Run, dynamics: list[RobotModel]) -> Robot:
     return robot.remodelled(model, now)
 
 
-def _restarted(run: Run, robot: Robot, stamp: int) -> bool:
+def _restarted(run: Run, robot: Robot, start: _Row) -> bool:
     """Return whether a start is that of a new process: the robot stands although it was commanded."""
-    odometry = run.odometry
-    first = int(np.argmax(odometry.stamps >= stamp))
+    odometry, commands = run.odometry, run.cmd_vel_out.stamps
+    soon = np.abs(odometry.received - start.received) <= MARGIN
+    later = np.flatnonzero(soon & (odometry.stamps >= start.stamp))
+    if not len(later):
+        return False
+    first = later[0]
     now = int(odometry.stamps[first])
-    commands = run.cmd_vel_out.stamps
-    if now < stamp or ((commands >= stamp) & (commands <= now)).any():
+    if ((commands >= start.stamp) & (commands <= now)).any():
         return False
     return not odometry.values[first, 3:5].any() and robot.at(now).twist != (0.0, 0.0)
 
