@@ -122,6 +122,31 @@ class MissedMessages:
         return message.sent
 
 
+class Heard:
+    """When a reliable publisher was heard, by its own times as far as these are plausible (ns)."""
+
+    __slots__ = ('last', 'several', 'shortest')
+
+    def __init__(self) -> None:
+        """Start without messages."""
+        self.last = 0
+        """When it had sent, or sent again, what was received last."""
+        self.several = False
+        self.shortest = 0
+        """The shortest time between two of its messages; 0 if there was one only."""
+
+    def hear(self, message: ReceivedMessage) -> None:
+        """Process a message."""
+        received = message.received or time.time_ns()
+        # A clock of another machine may be ahead.
+        sent = max(min(message.sent, received), received - MAX_WAIT)
+        if self.last:
+            between = max(sent - self.last, 0)
+            self.shortest = min(self.shortest, between) if self.several else between
+            self.several = True
+        self.last = sent
+
+
 class CallbackReception:
     """Receives from one subscription, whose callback an executor calls.
 
@@ -132,7 +157,7 @@ class CallbackReception:
     missed = 0
     doubtful = False
     confirmed: frozenset[bytes] = frozenset()
-    last: Mapping[bytes, int] = MappingProxyType({})
+    heard: Mapping[bytes, Heard] = MappingProxyType({})
 
     def __init__(
         self, node: Node, kind: type, topic: str, depth: int, callback: Callable[[bytes], None]
@@ -262,8 +287,8 @@ class CountingReception:
         self._reliable_from: dict[bytes, float] = {}
         self.confirmed: set[bytes] = set()
         """Reliable publishers (GID) that have delivered all that they sent before the end."""
-        self.last: dict[bytes, int] = {}
-        """Of each reliable publisher, when it had sent, or sent again, what was received last (ns)."""
+        self.heard: dict[bytes, Heard] = {}
+        """What was heard of each reliable publisher (GID)."""
 
     @property
     def missed(self) -> int:
@@ -303,9 +328,9 @@ class CountingReception:
     def _receive_reliable(self, message: ReceivedMessage) -> None:
         if message.number is not None:
             self._reliable_from.setdefault(message.publisher, message.number)
-        # A clock of another machine may be ahead.
-        received = message.received or time.time_ns()
-        self.last[message.publisher] = max(min(message.sent, received), received - MAX_WAIT)
+        if (heard := self.heard.get(message.publisher)) is None:
+            heard = self.heard[message.publisher] = Heard()
+        heard.hear(message)
         if self._is_late(message):
             # A reliable publisher delivers in order.
             self.confirmed.add(message.publisher)

@@ -198,12 +198,13 @@ class Recorder(Node):  # type: ignore[misc]
         """Return the topics of which a reliable publisher's last messages may be missing, and why."""
         found = {}
         for topic, reception in self._receptions.items():
-            for publisher in reception.last.keys() - reception.confirmed:
-                last = reception.last[publisher]
-                moment = last, last + int(ACTIVE * NANOSECONDS)
-                if self._overflow.dropped(*moment):
+            for publisher in reception.heard.keys() - reception.confirmed:
+                heard = reception.heard[publisher]
+                end = heard.last + int(ACTIVE * NANOSECONDS)
+                # What was dropped sooner than its next message can have been sent was of others.
+                if self._overflow.dropped(heard.last + heard.shortest // 2, end):
                     found[topic] = 'a buffer overflowed, and then its publisher was silent'
-                elif self._overflow.held(*moment) and publisher not in self._publishers_of(topic):
+                elif self._overflow.held(heard.last, end) and not self._lives(publisher, topic):
                     found[topic] = 'its publisher ended while this process was held'
         return found
 
@@ -214,13 +215,16 @@ class Recorder(Node):  # type: ignore[misc]
         return [
             topic
             for topic in self._in_doubt()
-            if self._publishers_of(topic)
-            & self._receptions[topic].last.keys() - self._receptions[topic].confirmed
+            if any(
+                self._lives(publisher, topic)
+                for publisher in self._receptions[topic].heard.keys() - self._receptions[topic].confirmed
+            )
         ]
 
-    def _publishers_of(self, topic: str) -> set[bytes]:
-        """Return the publishers of a topic that have not ended, as far as that is known."""
-        return {bytes(one.endpoint_gid) for one in self.get_publishers_info_by_topic(topic)}
+    def _lives(self, publisher: bytes, topic: str) -> bool:
+        """Return whether a publisher has not ended, as far as that is known."""
+        there = self.get_publishers_info_by_topic(topic)
+        return any(bytes(one.endpoint_gid) == publisher for one in there)
 
     def _report_missed(self) -> None:
         for topic, reception in self._receptions.items():

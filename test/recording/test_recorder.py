@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from types import SimpleNamespace
 from unittest import mock
 
 import pytest
@@ -327,19 +326,34 @@ def test_a_wait_that_is_cut_short_or_too_long_makes_the_recording_incomplete(dou
 
 
 def test_what_was_sent_again_counts_from_when_it_was_received():
-    made = SimpleNamespace(last={}, _reliable_from={}, _is_late=lambda _: False, _receive=lambda _: None)
     second, wait = 10**9, reception.MAX_WAIT
     for sent, received, last in (
-        (100, 200, 100),
+        (5 * second - 100, 5 * second, 5 * second - 100),
         (0, 5 * second, 5 * second - wait),
         (second, 5 * second, 5 * second - wait),
         # The clock of another machine is ahead.
         (9 * second, 5 * second, 5 * second),
     ):
-        reception.CountingReception._receive_reliable(
-            made, ReceivedMessage(b'', b'publisher', 1, sent, received)
-        )
-        assert made.last == {b'publisher': last}
+        heard = reception.Heard()
+        heard.hear(ReceivedMessage(b'', b'', 1, sent, received))
+        assert (heard.last, heard.shortest) == (last, 0)
+        heard.hear(ReceivedMessage(b'', b'', 2, last + 5 * second, last + 5 * second))
+        assert heard.shortest == 5 * second
+        # At the same time.
+        for number in (3, 4):
+            heard.hear(ReceivedMessage(b'', b'', number, last + 9 * second, last + 9 * second))
+        heard.hear(ReceivedMessage(b'', b'', 5, last + 20 * second, last + 20 * second))
+        assert heard.shortest == 0
+
+
+def test_what_is_dropped_before_the_next_message_of_a_publisher_is_due_was_of_others(doubt):
+    """As when a process ends that has hundreds of publishers, each of which is taken back."""
+    heard = [*doubt.recorder._receptions['/cmd_vel'].heard.values()]
+    assert all(one.shortest < 10**8 for one in heard)
+    assert doubt.recorder._in_doubt() == {'/cmd_vel': SILENT}
+    for one in heard:
+        one.shortest = 10**9
+    assert doubt.recorder._in_doubt() == {}
 
 
 # --- Publishers of different quality of service
