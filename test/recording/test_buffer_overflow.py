@@ -59,7 +59,7 @@ def test_where_nobody_counts_a_burst_is_an_overflow(receiver):
 def test_a_process_that_was_held_may_have_missed_something(monkeypatch):
     now = 10**18
     monkeypatch.setattr(overflow.time, 'time_ns', lambda: now)
-    watched = Overflow(counted=True)
+    watched = Overflow(counted=False)
     for step in (1, 200, 300):
         now += step * MILLISECOND
         watched.look()
