@@ -380,6 +380,13 @@ def _stood_since(run: Run, index: int) -> bool:
 def _commanded(run: Run, given: Mapping[str, Any] | None) -> Driven:
     """Return the robot after each `cmd_vel`, or `joint_command` if it is driven by its wheels."""
     values = dict(given if given is not None else run.of_node(ROBOT))
+    first = min(
+        (int(one.received[0]) for one in (run.cmd_vel, run.wheel_commands) if len(one)), default=0
+    )
+    for received, change in run.parameter_events:
+        # A robot that starts later than the recorder reports its first values as changes.
+        if given is None and base_name(change.node) == ROBOT and received < first:
+            values.update(change.values)
     parameters = VirtualRobotParameters().changed(values)
     source, series = 'cmd_vel', run.cmd_vel
     if parameters.command_interface == 'wheels':

@@ -143,7 +143,8 @@ def bag_files(path: Path) -> list[Path]:
         raise NotABagError(f'there is no bag {path}, and no journal {journal_of(path)}')
     present = set(path.iterdir())
     # A file whose compression was interrupted exists twice.
-    files = [one for one in present if one.is_file() and one.with_suffix('') not in present - {one}]
+    twice = {one for one in present if one.suffix == ZSTD and one.with_suffix('') in present}
+    files = [one for one in present - twice if one.is_file()]
     # A journal beside is of another recording.
     files = [one for one in files if file_kind(one) and not is_journal(one)]
     if not files:

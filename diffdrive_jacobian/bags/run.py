@@ -243,6 +243,8 @@ def read_run(
         codecs = {number: topic.codec(types[number]) for number, topic in chosen.items()}
         tally = read_messages(reader, codecs, take, interrupted)
         noted = custom_data(reader)
+    # Of this robot.
+    lost = Counter({on: count for on, count in lost_messages(noted).items() if on in tally.expected})
     series, covariances = {}, {}
     for table in TABLES:
         found, count = rows[table.series], len(table.columns)
@@ -263,7 +265,7 @@ def read_run(
         parameter_events=tuple(changes),
         fault_events=tuple(fault_events),
         skipped=tally.skipped,
-        missing=dict(tally.missing + Counter(lost_messages(noted))),
+        missing=dict(tally.missing + lost),
         notes=(*tally.notes(), *(f'lost: {one}' for one in noted_losses(noted))),
         **series,
     )

@@ -119,11 +119,11 @@ def csv_text(run: Run) -> str:
     Raises:
         BagError: The run has no odometry.
     """
+    rows = np.column_stack([*table(run).values()]).tolist()
+    stamps = (run.odometry.stamps - run.odometry.stamps[0]).tolist()
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(COLUMNS)
-    stamps = (run.odometry.stamps - run.odometry.stamps[0]).tolist()
-    rows = np.column_stack([*table(run).values()]).tolist()
     for stamp, (_, *values) in zip(stamps, rows, strict=True):
         writer.writerow([decimal_seconds(stamp), *map(_decimal, values)])
     return text.getvalue()

@@ -222,11 +222,10 @@ def _missing(run: Run) -> Iterator[str]:
     together = {'odom': run.odometry, 'joint_states': run.wheels, 'ground_truth': run.ground_truth}
     lost = _topics_with_faults(run)
     for name, series in together.items():
-        if not len(series) or name in lost:
+        there = [one.stamps for other, one in together.items() if other not in lost | {name}]
+        if not len(series) or name in lost or not there:
             continue
-        others = np.concatenate(
-            [o.stamps for other, o in together.items() if other not in lost | {name}]
-        )
+        others = np.concatenate(there)
         stamps = np.setdiff1d(others, series.stamps)
         begins, ends = series.stamps.min(), others.max(initial=0)
         # Of the last time a recording may have the first message only, which is that of the odometry.
@@ -283,6 +282,6 @@ def _notes(run: Run, driven: Driven, found: Verification) -> Iterator[str]:
         )
     elif not run.parameter_events or not run.fault_events:
         yield (
-            'changes of parameters and faults of the motors are known only if /parameter_events and, of '
-            'a lockstep world, /fault_events are recorded'
+            'if parameters of the robot changed, or a fault of a lockstep world acted on its motors, '
+            '/parameter_events and /fault_events must be recorded'
         )

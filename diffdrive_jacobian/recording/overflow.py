@@ -43,6 +43,9 @@ class _Times:
 
     def add(self, stamp: int) -> None:
         times = self.times
+        if times and stamp <= times[-1]:
+            # Of another queue, or the clock was set back.
+            return
         if len(times) > 1 and stamp - times[-2] < _SPACING:
             times[-1] = stamp
         else:

@@ -203,7 +203,7 @@ class Recorder(Node):  # type: ignore[misc]
                 end = heard.last + int(ACTIVE * NANOSECONDS)
                 # What was dropped sooner than its next message can have been sent was of others.
                 if self._overflow.dropped(heard.last + heard.shortest // 2, end):
-                    found[topic] = 'a buffer overflowed, and then its publisher was silent'
+                    found[topic] = 'a buffer overflowed, and then its publisher ended or was silent'
                 elif self._overflow.held(heard.last, end) and not self._lives(publisher, topic):
                     found[topic] = 'its publisher ended while this process was held'
         return found

@@ -360,7 +360,8 @@ def open_recording(
                 return Recording(Path(name), lossless=lossless)
     except OSError as error:
         where = output or 'this directory'
-        raise OSError(f'cannot record to {where}: {(error.strerror or str(error)).lower()}') from error
+        why = error.strerror.lower() if error.strerror else str(error)
+        raise OSError(f'cannot record to {where}: {why}') from error
     raise AssertionError('there is always another name')
 
 

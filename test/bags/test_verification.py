@@ -28,6 +28,7 @@ from diffdrive_jacobian.bags.verification import (
     verify,
 )
 from diffdrive_jacobian.faults import ActuatorLag, DeadWheel, Loss, SaturatedWheel
+from diffdrive_jacobian.messages.codecs import Changes
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
@@ -232,7 +233,7 @@ def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, driven, limit
     assert verify(replace(run, fault_events=of_another)).distances.max() > 0.01
     without = verify(replace(run, fault_events=()))
     assert without.distances.max() > 0.01
-    assert '/fault_events are recorded' in without.notes[-1]
+    assert '/fault_events must be recorded' in without.notes[-1]
 
 
 def test_time_that_goes_back_is_followed(robot_at, driven):
@@ -474,6 +475,25 @@ def test_what_a_fault_loses_is_not_missing(lockstep, robot_at, driven):
     run = driven([(0.3, 0.5)], 1.0)
     assert len(run.odometry) < len(run.wheels) - 5
     assert 'missing messages of odom were not looked for' in held(run).notes[-1]
+
+
+def test_without_another_topic_of_the_robot_nothing_can_be_missed(lockstep, robot_at, driven):
+    robot_at()
+    lockstep.inject(Loss('odom', 0.3), Loss('joint_states', 0.3))
+    run = driven([(0.3, 0.5)], 1.0)
+    assert len(run.wheels) < 45
+    # As of a robot that drifts.
+    held(replace(run, ground_truth=run.odometry))
+
+
+def test_parameters_that_a_robot_reports_when_it_starts_are_used(run):
+    slow = {'linear.x.max_velocity': 0.05}
+    (name,) = [node for node in run.parameters if node.endswith('virtual_robot')]
+    by_time = replace(run, cmd_vel_out=rows(run.cmd_vel_out, NOTHING))
+    held(by_time, 0.02)
+    at = int(run.cmd_vel.received[0]) - 1
+    started = replace(by_time, parameter_events=((at, Changes(name, slow, at)),))
+    assert verify(started).distances.max() > 0.05
 
 
 TAKES_TIME = {

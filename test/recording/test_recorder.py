@@ -229,7 +229,7 @@ def test_bursts_are_recorded_in_order_until_the_end(ros, reliability):
     assert (setting.sink.missed, setting.sink.left_out) == ({}, {})
 
 
-SILENT = 'a buffer overflowed, and then its publisher was silent'
+SILENT = 'a buffer overflowed, and then its publisher ended or was silent'
 
 
 class Doubt(Setting):
