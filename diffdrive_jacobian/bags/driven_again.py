@@ -239,7 +239,7 @@ def _moving(run: Run, index: int) -> Robot:
 
 
 def _following(robot: Robot, run: Run, dynamics: list[RobotModel]) -> Robot:
-    """Let a robot follow the last command that acts already, and then those that were given later."""
+    """Return a robot that follows the last command in effect, and then those that were given later."""
     stamps, now = run.cmd_vel_out.stamps, robot.stamp
     given = int(np.searchsorted(stamps, now, side='right'))
     model = dynamics[given]

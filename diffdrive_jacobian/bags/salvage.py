@@ -140,7 +140,7 @@ class _Claims:
         self._unchecked |= self._in_data and not checked
 
     def compare(self, file: BinaryIO, note: Note, doubt: Note) -> None:
-        """Say what differs, and what cannot be checked, when all of the file was read."""
+        """Report what differs, and what cannot be checked, after all of the file was read."""
         data_is_right = False
         for what, (start, end, checksum) in self._checksums.items():
             right = checksum != 0 and file_checksum(file, start, end) == checksum
