@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diffdrive_jacobian.calibration.clock import time_offset
-from diffdrive_jacobian.calibration.consistency import misfit
-from diffdrive_jacobian.calibration.fit import fit
+from diffdrive_jacobian.calibration.consistency import judged
+from diffdrive_jacobian.calibration.fit import SMALLEST, fit
+from diffdrive_jacobian.calibration.hypotheses import UNKNOWN
 from diffdrive_jacobian.calibration.initial_estimate import initial_estimate, unit
 from diffdrive_jacobian.calibration.model import (
+    CLOCKS,
     LEVER_ARM,
-    TIME_OFFSETS,
-    UNDETERMINED,
     YAW_OFFSET,
     Array,
     CalibrationDrive,
@@ -50,23 +50,19 @@ LARGE_WHEEL_NOISE = 1e-2
 """Wheel travel variance beyond which the reference does not follow the wheels (m)."""
 NOTABLE_WHEEL_NOISE = 5e-4
 """Wheel travel variance that is worth a note (m)."""
-EXACT = Noise(wheel=1e-7, position=2e-5, heading=2e-5)
-"""Noise below which a reference is no observation of a real robot."""
-DISAGREEMENT = 5.5
-"""Deviations by which a recording must differ from the others to be refused; one in a million does."""
-SAME = 0.005
-"""Multipliers that differ by less agree in any case [-]."""
+EXACT = 2e-5
+"""Residual of the positions below which a reference is no observation of a real robot (m)."""
 MOST_PARTS, MOST_LEFT_OUT = 8, 0.4
 """Most parts of the drives that are left out, and the largest share of the distance."""
 ROUNDS = 3
-LONG_DELAY = 0.2
-"""Time offset that is worth a note (s)."""
+LONG_DELAY, NOTABLE_DRIFT = 0.2, 2e-4
+"""Time offset (s) and drift of a clock that are worth a note. Quartz clocks drift by less than 1e-4."""
+ALIGNED = 0.05
+"""Error of the times of poses with which jumps of the reference are recognized (s)."""
 UNUSUAL = 1.15
 """Factor beyond which multipliers are not explained by manufacturing."""
 CORRELATED, LEAST_ERRORS = 0.5, 60
 """Correlation of successive errors that is noted, and fewest errors that show it."""
-RARE = 0.04
-"""Period of the wheels beyond which it matters how they move between their samples (s)."""
 BACKWARD = 0.6
 """Angle from straight back within which a sensor looks backwards (rad)."""
 
@@ -98,12 +94,21 @@ class Calibration:
     def covariance(self) -> Array:
         """Covariance of the multipliers, shape (3, 3)."""
         scale = self.multipliers
-        return np.asarray(self.estimate.covariance()[:3, :3] * scale[:, None] * scale)
+        return np.asarray(self.estimate.covariance[:3, :3] * scale[:, None] * scale)
 
     @property
-    def time_offsets(self) -> Array:
-        """What is added to the times of the poses of each recording (s)."""
-        return self.estimate.parameters[TIME_OFFSETS:]
+    def clocks(self) -> Array:
+        """Offset (s) and drift (s/s) of the clock of each recording, shape (recordings, 2).
+
+        To the times of the poses the offset is added in their middle, and from there on the drift times
+        the time since.
+        """
+        return self.estimate.parameters[CLOCKS:].reshape(-1, 2)
+
+    @property
+    def clock_deviations(self) -> Array:
+        """Standard deviations of the same, shape (recordings, 2)."""
+        return np.sqrt(np.diag(self.estimate.covariance))[CLOCKS:].reshape(-1, 2)
 
     def residuals(self) -> list[Array]:
         """Return what remains between the reference and the most likely poses of the sensor.
@@ -130,7 +135,7 @@ class Calibration:
     @property
     def undetermined(self) -> list[tuple[str, str]]:
         """Combinations of the multipliers that the drives do not determine, and what determines them."""
-        return undetermined(self.estimate.covariance()[:3, :3])
+        return undetermined(self.estimate.covariance[:3, :3])
 
 
 def calibrate(
@@ -150,76 +155,19 @@ def calibrate(
     for one in recordings:
         _check(one)
     recordings = tuple(map(thinned_samples, recordings))
-    period = max(float(np.median(np.diff(one.wheel_time))) for one in recordings)
-    found, errors = [], []
-    for smooth in (True, False) if period > RARE else (True,):
-        try:
-            found.append(_calibrated(recordings, nominal, given, smooth))
-        except CalibrationError as error:
-            errors.append(error)
-    if not found:
-        raise errors[0]
-    return found[0] if len(found) == 1 else _compared(found, period)
-
-
-def _compared(found: list[Calibration], period: float) -> Calibration:
-    """Return the more likely one of two results, with their difference in its uncertainty."""
-    first, second = sorted(found, key=_misfit)
-    difference = second.estimate.parameters - first.estimate.parameters
-    deviations = np.sqrt(np.diag(first.estimate.covariance())[:3])
-    if (np.abs(difference[:3]) < deviations).all():
-        return first
-    note = (
-        f'the wheels are recorded every {period:.2g} s, and the multipliers depend on how they move '
-        'between their samples: record them more often'
-    )
-    widened = first.estimate.widened(difference[np.newaxis])
-    return replace(first, estimate=widened, notes=(*first.notes, note))
-
-
-def _misfit(result: Calibration) -> float:
-    """Return what falls with the likelihood of the noise, of three residuals of wheels for each pose."""
-    noise = result.estimate.noise
-    return float(3.0 * np.log(noise.wheel) / 2.0 + 2.0 * np.log(noise.position) + np.log(noise.heading))
-
-
-def _calibrated(
-    recordings: tuple[CalibrationDrive, ...], nominal: Geometry, given: Given, smooth: bool
-) -> Calibration:
-    notes = [note for one in recordings for note in sampling_notes(one)]
-    offsets = np.zeros(len(recordings))
-    for index, one in enumerate(recordings):
-        found = given.time_offset if given.time_offset is not None else time_offset(one, nominal)
-        offsets[index] = 0.0 if found is None else found
-        if found is None:
-            notes.append(
-                f'{one.name}: the speeds of the wheels and of the reference do not show the offset '
-                'between their clocks, which is assumed to be about 0 s'
-            )
-    segments = [
-        segment
-        for index, one in enumerate(recordings)
-        for segment in overlapping(one, index, offsets[index], nominal.wheel_radius, smooth)
-    ]
-    if not segments:
-        raise CalibrationError(
-            'too short: the wheels and the reference have less than 5 poses in common without a gap'
-        )
     names = [one.name for one in recordings]
-    first = initial_estimate(segments, nominal, offsets)
-    segments, found_notes = without_jumps(segments, first, offsets, names)
-    segments, thinned = thinned_poses(segments)
-    notes += [*found_notes, thinned] if thinned else found_notes
-    first = initial_estimate(segments, nominal, offsets)
-    parameters = np.concatenate([np.log(first.geometry.multipliers), first.sensor, offsets])
-    free = np.ones(len(parameters), dtype=bool)
-    if given.lever_arm is not None:
-        parameters[LEVER_ARM], free[LEVER_ARM] = given.lever_arm, False
-    if given.yaw_offset is not None:
-        parameters[YAW_OFFSET], free[YAW_OFFSET] = given.yaw_offset, False
-    free[TIME_OFFSETS:] = given.time_offset is None
-    start = Estimate(parameters=parameters, noise=START, free=free, information=np.zeros((0, 0)))
-    segments, motions, estimate, misfits = _consistent(segments, nominal, start, given, names)
+    parameters, clock_notes = _clocks(recordings, nominal, given)
+    while True:
+        segments, parameters, notes = _prepared(recordings, nominal, parameters)
+        start = _start(parameters, given)
+        segments, motions, estimate, misfits = _consistent(segments, nominal, start, given, names)
+        moved = max(
+            float(np.abs(one.at(estimate.parameters) - one.at(parameters)).max()) for one in segments
+        )
+        if moved < ALIGNED:
+            break
+        # With a clock that drifts, the reference seems to jump where the robot starts and stops.
+        parameters[CLOCKS:] = estimate.parameters[CLOCKS:]
     result = Calibration(
         nominal=nominal,
         estimate=estimate,
@@ -227,6 +175,7 @@ def _calibrated(
         segments=tuple(segments),
         motions=tuple(motions),
     )
+    notes = [note for one in recordings for note in sampling_notes(one)] + clock_notes + notes
     notes += [*misfits, *_judged(result, given)]
     correlation = _correlation(result)
     if correlation > CORRELATED:
@@ -236,14 +185,78 @@ def _calibrated(
         )
         # As of the mean of an autoregressive process of first order.
         factor = (1.0 + correlation) / (1.0 - correlation)
-        result = replace(result, estimate=replace(estimate, information=estimate.information / factor))
-    for one, offset in zip(recordings, result.time_offsets.tolist(), strict=True):
-        if given.time_offset is None and abs(offset) > LONG_DELAY:
+        widened = replace(estimate, covariance=estimate.covariance * factor)
+        result = replace(result, estimate=widened)
+    if given.time_offset is None:
+        notes += _clock_notes(result)
+    return replace(result, notes=tuple(notes))
+
+
+def _clocks(
+    recordings: Sequence[CalibrationDrive], nominal: Geometry, given: Given
+) -> tuple[Array, list[str]]:
+    """Return parameters with the offset of each clock, the others 0, and notes."""
+    parameters, notes = np.zeros(CLOCKS + 2 * len(recordings)), []
+    for index, one in enumerate(recordings):
+        found = given.time_offset if given.time_offset is not None else time_offset(one, nominal)
+        if found is None:
+            notes.append(
+                f'{one.name}: the speeds of the wheels and of the reference do not show the offset '
+                'between their clocks, which is assumed to be about 0 s'
+            )
+        parameters[CLOCKS + 2 * index] = found or 0.0
+    return parameters, notes
+
+
+def _prepared(
+    recordings: Sequence[CalibrationDrive], nominal: Geometry, parameters: Array
+) -> tuple[list[Segment], Array, list[str]]:
+    """Return continuous motions, approximate parameters, and notes, given the clocks."""
+    segments = [
+        segment
+        for index, one in enumerate(recordings)
+        for segment in overlapping(one, index, parameters, nominal.wheel_radius)
+    ]
+    if not segments:
+        raise CalibrationError(
+            'too short: the wheels and the reference have less than 5 poses in common without a gap'
+        )
+    first = initial_estimate(segments, nominal, parameters)
+    names = [one.name for one in recordings]
+    segments, notes = without_jumps(segments, nominal, first, names)
+    segments, thinned = thinned_poses(segments)
+    notes += [thinned] if thinned else []
+    return segments, initial_estimate(segments, nominal, parameters), notes
+
+
+def _start(parameters: Array, given: Given) -> Estimate:
+    """Return what the estimate starts from, with the parameters that are known."""
+    parameters, free = parameters.copy(), np.ones(len(parameters), dtype=bool)
+    if given.lever_arm is not None:
+        parameters[LEVER_ARM], free[LEVER_ARM] = given.lever_arm, False
+    if given.yaw_offset is not None:
+        parameters[YAW_OFFSET], free[YAW_OFFSET] = given.yaw_offset, False
+    free[CLOCKS:] = given.time_offset is None
+    unknown = np.zeros((len(parameters),) * 2)
+    return Estimate(parameters=parameters, noise=START, free=free, covariance=unknown)
+
+
+def _clock_notes(result: Calibration) -> list[str]:
+    """Return notes about clocks that differ."""
+    notes = []
+    clocks = np.column_stack([result.clocks, result.clock_deviations]).tolist()
+    for one, (offset, drift, _, deviation) in zip(result.recordings, clocks, strict=True):
+        if abs(offset) > LONG_DELAY:
             notes.append(
                 f'{one.name}: the clock of the reference differs by {offset:.3f} s from that '
                 'of the wheels'
             )
-    return replace(result, notes=tuple(notes))
+        if abs(drift) > max(NOTABLE_DRIFT, 4.0 * deviation):
+            notes.append(
+                f'{one.name}: the clock of the reference runs {100.0 * abs(drift):.2g} % '
+                f'{"slow" if drift > 0.0 else "fast"} by that of the wheels, which is corrected'
+            )
+    return notes
 
 
 def _check(one: CalibrationDrive) -> None:
@@ -277,7 +290,8 @@ def _judged(result: Calibration, given: Given) -> list[str]:
             'robot, and do the wheels slip?'
         )
     notes = []
-    if noise.wheel < EXACT.wheel and noise.position < EXACT.position and noise.heading < EXACT.heading:
+    residuals = np.concatenate(result.residuals())[:, 1:3]
+    if np.sqrt(np.mean(residuals**2)) < EXACT:
         notes.append(
             'the reference follows the wheels without error: it is simulated without slip, or odometry '
             'that was computed from these wheels, which does not show their true dimensions'
@@ -311,7 +325,7 @@ def _correlation(result: Calibration) -> float:
         first.append(errors[:-1][single].ravel())
         second.append(errors[1:][single].ravel())
     a, b = np.concatenate(first), np.concatenate(second)
-    if len(a) < LEAST_ERRORS:
+    if len(a) < LEAST_ERRORS or result.estimate.noise.position <= 1.01 * SMALLEST.position:
         return 0.0
     return float(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), 0.0, 0.99))
 
@@ -325,13 +339,13 @@ def _estimated(
     """
     estimate, motions = start, list(segments)
     for _ in range(ROUNDS):
-        before = estimate.parameters[TIME_OFFSETS:]
-        motions = [merged(one, nominal, before[one.recording]) for one in segments]
+        before = estimate.parameters
+        motions = [merged(one, nominal, before) for one in segments]
         motions = [one for one in motions if len(one.time) > 1]
         if not motions:
             raise CalibrationError('the wheels never turn')
         estimate = fit(motions, nominal, estimate, given, start.parameters)
-        if np.abs(estimate.parameters[TIME_OFFSETS:] - before).max() < 1e-3:
+        if np.abs(estimate.parameters - before)[CLOCKS::2].max() < 1e-3:
             break
     return estimate, motions
 
@@ -345,34 +359,21 @@ def _consistent(
     """
     segments, left_out = list(segments), 0.0
     notes: list[str] = []
-    estimate, motions = _estimated(segments, nominal, start, given)
-    while (found := misfit(motions, nominal, estimate)) is not None:
-        window = found.window
-        where = found.words if window is None else f'{names[window.recording]}: {found.words}'
-        if window is None or window.whole or len(notes) == MOST_PARTS:
-            break
-        left_out += window.share * (1.0 - left_out)
-        if left_out > MOST_LEFT_OUT:
-            break
-        notes.append(f'{where}. A wheel skids or the reference is wrong: this part is left out')
-        segments = without(segments, window.recording, window.begin, window.end)
-        start = replace(start, parameters=estimate.parameters, noise=estimate.noise)
+    while True:
         estimate, motions = _estimated(segments, nominal, start, given)
-    if found is None:
-        return segments, motions, estimate, notes
-    certain = found.deviations > DISAGREEMENT and abs(found.difference) > SAME
-    if window is not None and window.whole and certain:
-        raise CalibrationError(f'the recordings disagree about the multipliers: {where}')
-    middle, half = found.shifts.mean(axis=0), (found.shifts[0] - found.shifts[1]) / 2.0
-    widened = replace(estimate, parameters=estimate.parameters + middle).widened(
-        np.stack([half, middle / found.deviations])
-    )
-    if undetermined(widened.covariance()[:3, :3]) != undetermined(estimate.covariance()[:3, :3]):
-        raise CalibrationError(
-            f'{where}. Which is right is unknown, and one of the multipliers is uncertain by more than '
-            f'{100.0 * UNDETERMINED:g} %'
-        )
-    notes.append(
-        f'{where}. Which is right is unknown: the estimate lies between, and its deviations include both'
-    )
-    return segments, motions, widened, notes
+        verdict = judged(motions, nominal, estimate)
+        part = verdict.interval
+        if part is None:
+            break
+        words = f'{names[part.recording]}: {verdict.words}'
+        if part.whole and verdict.sure:
+            raise CalibrationError(f'the recordings disagree about the multipliers: {words}')
+        left_out += part.share * (1.0 - left_out)
+        if not verdict.sure or left_out > MOST_LEFT_OUT or len(notes) == MOST_PARTS:
+            notes.append(f'{words}: {UNKNOWN}')
+            break
+        notes.append(f'{words}. A wheel skids or the reference is wrong: this part is left out')
+        segments = without(segments, part.recording, part.begin, part.end)
+        start = replace(start, parameters=estimate.parameters, noise=estimate.noise)
+    notes += [*verdict.slips, *([verdict.unnoticed] if verdict.unnoticed else [])]
+    return segments, motions, verdict.estimate, notes

@@ -1,11 +1,14 @@
 """The offset between the clocks of the wheels and of the reference, from the speeds that both show.
 
-With the correlations rho of the N speeds in the overlap, the log-likelihood ratio against independent
-speeds is `N g`, `g = -1/2 sum(log(1 - rho^2))`. The offset has the largest g. A motion that repeats
-itself agrees as well at others. Then the offset nearest to zero must also have the largest overlap.
+Forward speed and yaw rate of both are correlated at all offsets. With the correlations rho of N
+independent speeds in the overlap, `N g` with `g = -1/2 sum(log(1 - rho^2))` is the log-likelihood ratio
+against speeds that have nothing to do with each other. The offset has the largest g. A motion that
+repeats itself agrees as well at others: then the one nearest to zero must also have the largest overlap.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,87 +16,134 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.calibration.model import Array, CalibrationDrive, CalibrationError
 from diffdrive_jacobian.calibration.motion import Geometry
 
-WINDOW = 0.5
-"""Time over which speeds are means, at least (s)."""
-STEP = 0.1
-"""Time between them, at least (s)."""
+WINDOW, STEP = 0.5, 0.1
+"""Time over which speeds are means, and time between them, at least (s). Robots of this kind change
+their speed within about half a second; the estimate itself corrects an error of some tenths."""
 MOST = 1 << 17
-"""Largest number of them."""
-LEAST_OVERLAP = 0.5
-"""Overlap, as a share of the shorter recording, up to which offsets are searched."""
-NEAR = 5.0
-"""Offset up to which they are searched whatever the overlap (s)."""
-LEAST = 0.7
-"""Value of g below which an offset is not found."""
+"""Largest number of speeds: four hours. Longer drives have longer steps."""
+LEAST_OVERLAP, NEAR = 0.5, 5.0
+"""Overlap, as a share of the shorter recording, up to which offsets are searched, and offset up to which
+they are searched whatever the overlap (s): clocks that agree, in recordings that overlap little."""
 EVIDENCE = 20.0
-"""Log-likelihood ratio below which two offsets are about as good, or one is not found."""
-CLOSE = 0.3
-"""Difference of g below which they are about as good in any case: offsets are multiples of the step."""
-PERFECT = 0.99
-"""Largest squared correlation: the speeds of a sensor off the axle are not those of the wheels."""
+"""Log-likelihood ratio below which an agreement may be chance. By chance one offset exceeds it with the
+probability exp(-20) = 2e-9, and one of `MOST` with 3e-4."""
+EXPLAINED = 0.75
+"""Share of the variance of the speeds that an offset explains at least."""
+ALIKE = 2.0
+"""Ratio of the variances that they do not explain up to which two offsets are about as good."""
+OFF_AXLE = 0.01
+"""Share of the variance that is never explained: the speeds of a sensor off the axle are not those of
+the wheels."""
 REMEDY = 'synchronize the clocks, or give the offset (--time-offset of calibrate_run)'
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Agreement:
+    """How well the speeds of both agree at offsets that increase by equal steps."""
+
+    offsets: Array
+    """Shape (n,) (s)."""
+    overlap: Array
+    """Time that both have in common, shape (n,) (s)."""
+    samples: Array
+    """Number of independent speeds in it, shape (n,)."""
+    searched: NDArray[np.bool_]
+    """Whether the offset may be the one, shape (n,)."""
+    g: Array
+    """0 where it is not searched or may be chance, shape (n,)."""
+
+    def best(self) -> int | None:
+        """Return the index of the largest g; None: no offset explains enough."""
+        largest = int(np.argmax(self.g))
+        return largest if self.g[largest] >= -0.5 * np.log(1.0 - EXPLAINED) else None
+
+    def about_as_good(self, best: int) -> list[int]:
+        """Return the indices of the maxima of g that are as high as the best one, with it."""
+        close = max(0.5 * np.log(ALIKE), EVIDENCE / self.samples[best])
+        least = self.g[best] - close
+        # Between two maxima g is lower by as much.
+        high = np.flatnonzero(self.g > least - close)
+        hills = np.split(high, np.flatnonzero(np.diff(high) > 1) + 1)
+        peaks = [int(hill[np.argmax(self.g[hill])]) for hill in hills]
+        return [peak for peak in peaks if self.g[peak] >= least]
+
+    def refined(self, index: int) -> float:
+        """Return the offset of the maximum of a parabola through g at an index and beside it (s)."""
+        low, middle, high = self.g[index - 1 : index + 2].tolist()
+        bend = low - 2.0 * middle + high
+        shift = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
+        step = float(self.offsets[1] - self.offsets[0])
+        return float(self.offsets[index]) + min(1.0, max(-1.0, shift)) * step
+
+
 def time_offset(recording: CalibrationDrive, nominal: Geometry) -> float | None:
-    """Return what must be added to the times of the poses; None: the speeds do not show it."""
+    """Return what must be added to the times of the poses; None: the speeds do not show it.
+
+    Raises:
+        CalibrationError: They show several, or one at the end of the range that is searched.
+    """
     wheels, poses = recording.wheel_time, recording.pose_time
     window = max(WINDOW, *(float(np.median(np.diff(time))) for time in (wheels, poses)))
-    length = max(wheels[-1] - wheels[0], poses[-1] - poses[0])
-    step = max(STEP, float(length) / MOST)
-    if min(wheels[-1] - wheels[0], poses[-1] - poses[0]) < 3.0 * window:
+    lengths = float(wheels[-1] - wheels[0]), float(poses[-1] - poses[0])
+    if min(lengths) < 3.0 * window:
         return None
+    step = max(STEP, max(lengths) / MOST)
     ours, theirs = _wheel_speeds(recording, nominal, step, window), _pose_speeds(recording, step, window)
-    lags, overlap, found = _correlations(ours, theirs)
+    lags, overlap, correlations = _correlations(ours, theirs)
     offsets = wheels[0] - poses[0] + lags * step
     samples = overlap * step / window
-    allowed = (overlap >= LEAST_OVERLAP * np.max(overlap)) | (np.abs(offsets) <= NEAR)
-    either = (_ratio(np.maximum(found * [1.0, sign], 0.0)) for sign in (1.0, -1.0))
-    g, turned = (np.where(allowed & (samples * one >= EVIDENCE), one, 0.0) for one in either)
-    largest = int(np.argmax(g))
-    if g[largest] < LEAST:
+    searched = (overlap >= LEAST_OVERLAP * np.max(overlap)) | (np.abs(offsets) <= NEAR)
+
+    def agreement(turning: float) -> Agreement:
+        """Return how the speeds agree if the yaw rates have the same sign, 1, or the other one, -1."""
+        rho = np.maximum(correlations * [1.0, turning], 0.0)
+        g = -0.5 * np.log(1.0 - (1.0 - OFF_AXLE) * rho**2).sum(axis=1)
+        return Agreement(
+            offsets=offsets,
+            overlap=overlap * step,
+            samples=samples,
+            searched=searched,
+            g=np.where(searched & (samples * g >= EVIDENCE), g, 0.0),
+        )
+
+    same = agreement(1.0)
+    largest = same.best()
+    if largest is None:
         return None
-    close = max(CLOSE, EVIDENCE / samples[largest])
-    good = _maxima(g, g[largest] - close, close)
-    widest = max(good, key=lambda index: overlap[index])
-    fair = [index for index in good if overlap[widest] - overlap[index] <= abs(index - widest) / 2.0]
-    best = min(fair, key=lambda index: abs(offsets[index]))
-    if any(abs(offsets[index]) < abs(offsets[best]) for index in good):
-        listed = ', '.join(
-            f'{offsets[index]:.3f} s (overlap {overlap[index] * step:.0f} s)'
-            for index in sorted(good, key=lambda index: abs(offsets[index]))[:4]
-        )
-        raise CalibrationError(
-            f'{recording.name}: the motion repeats itself, and the wheels and the reference agree about '
-            f'as well at several time offsets: {listed}: {REMEDY}'
-        )
-    if not (allowed[max(best - 1, 0)] and allowed[min(best + 1, len(g) - 1)]):
-        raise CalibrationError(
-            f'{recording.name}: the wheels and the reference agree best at a time offset of '
-            f'{offsets[best]:.3f} s, the end of the range that is searched: {REMEDY}'
-        )
+    best = _nearest(same, same.about_as_good(largest), recording.name)
     # Swapped wheels turn the other way. That is reported later, and must not be taken for an offset.
-    other = int(np.argmax(samples * turned))
-    if samples[other] * turned[other] > samples[best] * g[best] and abs(offsets[other]) < abs(
+    turned = agreement(-1.0)
+    other = int(np.argmax(samples * turned.g))
+    if samples[other] * turned.g[other] > samples[best] * same.g[best] and abs(offsets[other]) < abs(
         offsets[best]
     ):
         return float(offsets[other])
-    low, middle, high = g[best - 1 : best + 2]
-    bend = low - 2.0 * middle + high
-    fine = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
-    return float(offsets[best] + np.clip(fine, -1.0, 1.0) * step)
+    return same.refined(best)
 
 
-def _maxima(g: Array, least: float, close: float) -> list[int]:
-    """Return the maxima of g that are at least `least`, with values lower by `close` between them."""
-    high = np.flatnonzero(g > least - close)
-    hills = np.split(high, np.flatnonzero(np.diff(high) > 1) + 1) if len(high) else []
-    peaks = [int(hill[np.argmax(g[hill])]) for hill in hills]
-    return [peak for peak in peaks if g[peak] >= least]
-
-
-def _ratio(correlations: Array) -> Array:
-    """Return g, shape (l,), of correlations, shape (l, k)."""
-    return np.asarray(-0.5 * np.log(1.0 - PERFECT * correlations**2).sum(axis=1))
+def _nearest(found: Agreement, good: list[int], name: str) -> int:
+    """Return which of some good offsets is meant: the nearest to zero, with the largest overlap."""
+    offsets, step = found.offsets, float(found.offsets[1] - found.offsets[0])
+    widest = max(good, key=lambda index: found.overlap[index])
+    # The overlap of an offset that is not at the maximum changes by a step with each step.
+    loss = {index: (found.overlap[widest] - found.overlap[index]) / step for index in good}
+    fair = [index for index in good if loss[index] <= abs(index - widest) / 2.0]
+    best = min(fair, key=lambda index: abs(offsets[index]))
+    by_distance = sorted(good, key=lambda index: abs(offsets[index]))
+    if by_distance[0] != best:
+        listed = ', '.join(
+            f'{offsets[index]:.3f} s (overlap {found.overlap[index]:.0f} s)' for index in by_distance[:4]
+        )
+        raise CalibrationError(
+            f'{name}: the motion repeats itself, and the wheels and the reference agree about as well '
+            f'at several time offsets: {listed}: {REMEDY}'
+        )
+    if not found.searched[max(best - 1, 0) : best + 2].all() or best in (0, len(offsets) - 1):
+        raise CalibrationError(
+            f'{name}: the wheels and the reference agree best at a time offset of {offsets[best]:.3f} '
+            f's, the end of the range that is searched: {REMEDY}'
+        )
+    return best
 
 
 def _correlations(ours: Array, theirs: Array) -> tuple[NDArray[np.int64], Array, Array]:
@@ -112,6 +162,7 @@ def _correlations(ours: Array, theirs: Array) -> tuple[NDArray[np.int64], Array,
     size = 1 << int(m + n).bit_length()
     columns = []
     for a, b in zip(ours.T, theirs.T, strict=True):
+        # Speeds that hardly change correlate with nothing.
         floors = [1e-6 * float(np.mean(one**2)) + 1e-18 for one in (a, b)]
         a, b = a - a.mean(), b - b.mean()
         products = np.fft.irfft(np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size)), size)[lags] / count

@@ -1,24 +1,30 @@
-"""Whether the multipliers are the same at all times, in each kind of motion, and in each recording.
+"""Whether the same multipliers hold in each kind of motion, at all times, and in each recording.
 
-A score test: windows of time and kinds of motion have multipliers of their own, as further parameters
-of the model. Their information and gradient at the estimate show, for any set of windows or kinds, how
-much a multiplier differs there from that in the rest. Source: doc/mathematics.md, "Calibration".
+How likely each of the hypotheses is, and what the parameters are then, follows from the gradient and
+the information of its change at the estimate. The result is the mean of all. Source:
+doc/mathematics.md, "Consistency".
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 
-from diffdrive_jacobian.calibration.fit import score
+from diffdrive_jacobian.calibration.hypotheses import (
+    ARCS,
+    DIFFERENCE,
+    IN_PLACE,
+    Cells,
+    Hypothesis,
+    Interval,
+    divided,
+    hypotheses,
+)
+from diffdrive_jacobian.calibration.linear_model import linearized
 from diffdrive_jacobian.calibration.model import (
     MULTIPLIERS,
-    TIME_OFFSETS,
     Array,
     Estimate,
     Segment,
@@ -27,113 +33,188 @@ from diffdrive_jacobian.calibration.model import (
 from diffdrive_jacobian.calibration.motion import Geometry
 from diffdrive_jacobian.calibration.preparation import poses_apart
 
-WINDOWS = 64
-"""Number of windows of equal distances into which all drives are divided."""
-FEWEST = 4
-"""Fewest poses for each window of a motion."""
 MOST_POSES = 2000
 """Number of poses that are used at most."""
 APART = 20.0
 """Steps of the encoders by which the wheels turn at least between the poses that are used. Between
 nearer ones much of their turns is reading error, which the score takes for motion that the reference
 lacks."""
-CHANCE = 3e-3
-"""Bound of the probability of a misfit by chance, among all windows, all kinds, or all recordings. It is
-less likely, because the sets overlap."""
-SPREAD = 0.02
-"""Standard deviation that is expected of a difference [-]. A difference that the data determine less
-well counts less: where a robot hardly turns, its turns are those of the steps of the encoders."""
-EXCESS = 1.25
+EXCESS = 2.0
 """Ratio of the squares in the median window to those of the model that may be chance."""
-STEADY = 1.0
-"""Time over which speeds are means to determine the kind of motion (s)."""
-CURVED = 0.1
-"""Ratio of the rotation to the translation of the wheels below which a motion is straight; above the
-inverse it is a turn in place."""
-WORDS = ('the left wheel travels', 'the right wheel travels', 'both wheels travel', 'the robot turns')
-DIRECTIONS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
-"""What may be more in one part than in another, as changes of the logarithms of the multipliers."""
-_SHAPE, _FORWARDS, _LEFT = np.unravel_index(np.arange(12), (3, 2, 2))
-KINDS = {
-    'drives straight': _SHAPE == 0,
-    'turns in place': _SHAPE == 1,
-    'drives arcs': _SHAPE == 2,
-    'turns left': (_SHAPE > 0) & (_LEFT == 1),
-    'turns right': (_SHAPE > 0) & (_LEFT == 0),
-    'drives backwards': (_SHAPE != 1) & (_FORWARDS == 0),
+LIKELY, SURE = 0.5, 0.9
+"""Probability of a change that is named, and of one that is acted on: slip becomes one of the
+parameters, and an interval is left out."""
+MOST_SLIPS = 4
+NOTICED = 4.0
+"""Deviations of slip that is noticed."""
+HARMFUL = 4.0
+"""Deviations by which slip that is not noticed may falsify a multiplier without a note."""
+TO_SEE_SLIP = {
+    IN_PLACE: 'drive arcs, too',
+    ARCS: 'turn in place, too',
+    'turns left': 'turn to both sides alike',
+    'turns right': 'turn to both sides alike',
 }
-"""Kinds of motion, each as a set of 12 cells: straight, in place or arc; backwards or forwards; right or
-left."""
+"""Kinds of motion in which wheels are known to slip, and what shows it."""
+SLIPS = (
+    'the left wheel travels',
+    'the right wheel travels',
+    'both wheels travel',
+    'the outer wheel travels',
+)
+NAMES = ('left radius', 'right radius', 'separation')
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Window:
-    """A part of a recording."""
+class LocalChanges:
+    """What is known of changes of the logarithms of the multipliers in single cells."""
 
-    recording: int
-    begin: float
-    """By the clock of the reference (s)."""
-    end: float
-    share: float
-    """Of the distance of all recordings."""
-    whole: bool
-    """Whether it is all of one of several recordings."""
+    S: Array
+    """Their information, shape (3 * cells, 3 * cells)."""
+    g: Array
+    """Their gradient, shape (3 * cells,)."""
+    moves: Array
+    """Changes of the parameters with them, shape (parameters, 3 * cells)."""
+
+    def information(self, directions: Array) -> Array:
+        """Return the information of changes in some directions, shape (n, 3 * cells)."""
+        return np.asarray(np.sum((directions @ self.S) * directions, axis=1))
+
+    def sizes(self, directions: Array, spreads: Array) -> tuple[Array, Array]:
+        """Return the most likely size of each change, and its variance, shapes (n,).
+
+        `spreads` are their prior standard deviations, shape (n,).
+        """
+        variances = 1.0 / (self.information(directions) + spreads**-2.0)
+        return -variances * (directions @ self.g), variances
+
+    def given(self, direction: Array, size: float, variance: float, moved: Array) -> LocalChanges:
+        """Return the same, once a change is one of the parameters that are estimated.
+
+        `moved` is how it moves the others, shape (parameters,).
+        """
+        along = self.S @ direction
+        return LocalChanges(
+            S=self.S - variance * np.outer(along, along),
+            g=self.g + along * size,
+            moves=self.moves - variance * np.outer(moved, along),
+        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Misfit:
-    """A part of the drives in which a multiplier is another one than in the rest."""
+class Verdict:
+    """What differs, and the parameters in view of all that may differ."""
 
-    window: Window | None
-    """None: it is a kind of motion."""
+    slips: tuple[str, ...]
+    """Where wheels slip."""
+    interval: Interval | None
+    """Which is different; None: all of it may be chance."""
     words: str
-    """What is different and where, without the name of the recording."""
-    difference: float
-    """Of the logarithm of the multiplier."""
-    deviations: float
-    """The same in standard deviations."""
-    shifts: Array
-    """What must be added to the parameters for those of the rest, and of this part, shape (2, n)."""
+    """How it is different."""
+    sure: bool
+    """Whether that is more than likely."""
+    unnoticed: str
+    """Slip that the drives would not show; '': there is none."""
+    estimate: Estimate
 
 
-def misfit(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -> Misfit | None:
-    """Return the most certain misfit at the most likely parameters; None: all may be chance."""
-    segments, estimate = _thinned(segments, estimate)
-    offsets = estimate.parameters[TIME_OFFSETS:]
-    windows, members = _windows(segments, nominal, offsets)
-    cells = [
-        np.column_stack([inside, len(windows) + _kinds(one, offsets[one.recording])])
-        for one, inside in zip(segments, members, strict=True)
-    ]
-    S, g, moves = _local(segments, nominal, estimate, cells, len(windows) + len(_SHAPE))
-    sets, limits = _sets(windows, _excess(S, g, len(windows)))
-    slopes = DIRECTIONS @ g.T @ sets.T
-    along = np.einsum('ki,aibj,kj->kab', DIRECTIONS, S, DIRECTIONS)
-    weights = np.sum((sets @ along) * sets, axis=2)
-    deviations = np.abs(slopes) / np.sqrt(weights + SPREAD**-2.0)
-    which, index = np.unravel_index(np.argmax(deviations / limits), deviations.shape)
-    if deviations[which, index] < limits[index]:
-        return None
-    difference = float(-slopes[which, index] / weights[which, index])
-    rest = moves @ DIRECTIONS[which] @ sets[index] * difference
-    part = rest.copy()
-    part[MULTIPLIERS] += DIRECTIONS[which] * difference
-    window = _window(sets[index], windows)
-    much = (
-        f'{WORDS[which]} {100.0 * abs(difference):.2g} % {"more" if difference > 0.0 else "less"} than'
-    )
-    if window is None:
-        words = f'where the robot {list(KINDS)[index]}, {much} elsewhere'
-    elif window.whole:
-        words = f'{much} in the other recordings'
-    else:
-        words = f'from {window.begin:.0f} to {window.end:.0f} s {much} in the rest'
-    return Misfit(
-        window=window,
+def judged(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -> Verdict:
+    """Return what differs between parts of the drives, at the most likely parameters."""
+    thinned, at = _thinned(segments, estimate)
+    cells = divided(thinned, nominal, at.parameters)
+    local = local_changes(thinned, nominal, at, cells)
+    every = hypotheses(cells)
+    directions = np.array([one.direction for one in every]).reshape(-1, len(local.g))
+    own = np.zeros((len(every), len(at.parameters)))
+    own[:, MULTIPLIERS] = np.array([one.own for one in every]).reshape(-1, 3)
+    of_kind = np.array([one.of_kind for one in every], dtype=bool)
+    # What the drives do not determine is no reason to doubt the rest.
+    spreads = np.array([one.spread for one in every])
+    known = local.information(directions) > spreads**-2.0
+    prior = np.where(known, [one.prior for one in every], 0.0)
+    excess = np.where(of_kind, 1.0, _excess(local, len(cells.windows)))
+    slips: list[str] = []
+    while True:
+        sizes, variances = local.sizes(directions, spreads)
+        bayes = (sizes**2 / variances / excess + np.log(variances / spreads**2)) / 2.0
+        weights = prior * np.exp(bayes - bayes.max(initial=0.0))
+        weights /= weights.sum() + (1.0 - prior.sum()) * np.exp(-bayes.max(initial=0.0))
+        right = np.array([one.right(size) for one, size in zip(every, sizes.tolist(), strict=True)])
+        # What a change of 1 adds to the parameters, if the rest is right, and if the part is.
+        by_rest = directions @ local.moves.T
+        by_part = by_rest + own
+        shares = np.concatenate([weights * (1.0 - right), weights * right])
+        units = np.concatenate([by_rest, by_part])
+        estimate = _averaged(estimate, shares, units, np.tile(sizes, 2), np.tile(variances, 2))
+        slipping = float(weights[of_kind].sum())
+        if slipping < LIKELY:
+            break
+        slip = int(np.argmax(np.where(of_kind, weights, 0.0)))
+        slips.append(every[slip].words(float(sizes[slip])))
+        if slipping < SURE or len(slips) == MOST_SLIPS:
+            break
+        moved = (by_part if right[slip] else by_rest)[slip]
+        local = local.given(directions[slip], sizes[slip], variances[slip], moved)
+    interval, words, sure = None, '', False
+    if (certainty := float(weights[~of_kind].sum())) > LIKELY:
+        other = int(np.argmax(np.where(of_kind, 0.0, weights)))
+        size = float(sizes[other])
+        interval, words = every[other].where, every[other].words(size)
+        sure = certainty > SURE
+    return Verdict(
+        slips=tuple(slips),
+        interval=interval if isinstance(interval, Interval) else None,
         words=words,
-        difference=difference,
-        deviations=float(deviations[which, index]),
-        shifts=np.stack([rest, part]),
+        sure=sure,
+        unnoticed='' if slips else _unnoticed(local, every, estimate),
+        estimate=estimate,
+    )
+
+
+def _averaged(
+    estimate: Estimate, shares: Array, units: Array, sizes: Array, variances: Array
+) -> Estimate:
+    """Return the mean of an estimate and of those with changes, and its covariance.
+
+    Args:
+        estimate: The estimate without a change. It has the share that the others leave.
+        shares: Probabilities of the changes, shape (n,).
+        units: What a change of 1 adds to the parameters, shape (n, parameters).
+        sizes: Sizes of the changes, shape (n,).
+        variances: Their variances, shape (n,).
+    """
+    mean = (shares * sizes) @ units
+    squares = (units.T * (shares * (sizes**2 + variances))) @ units
+    free = estimate.free
+    spread = (squares - np.outer(mean, mean))[np.ix_(free, free)]
+    return replace(
+        estimate,
+        parameters=estimate.parameters + mean,
+        covariance=estimate.covariance + estimate.of_free(spread),
+    )
+
+
+def _unnoticed(local: LocalChanges, every: Sequence[Hypothesis], estimate: Estimate) -> str:
+    """Return the slip that would falsify a multiplier by more than stated, and not be noticed.
+
+    That is so where a kind of motion has most of what is known of a multiplier.
+    """
+    found = [one for one in every if one.where in TO_SEE_SLIP and one.what in SLIPS]
+    if not found:
+        return ''
+    directions = np.stack([one.direction for one in found])
+    spreads = np.array([one.spread for one in found])
+    least = NOTICED * np.sqrt(local.sizes(directions, spreads)[1])
+    errors = np.abs(directions @ local.moves[MULTIPLIERS].T) * least[:, None]
+    ratios = errors / np.sqrt(np.diag(estimate.covariance)[MULTIPLIERS])
+    worst, which = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
+    if ratios[worst, which] < HARMFUL:
+        return ''
+    one = found[worst]
+    return (
+        f'where the robot {one.where}, it would not be noticed that {one.what} up to '
+        f'{100.0 * least[worst]:.2g} % less: the {NAMES[which]} multiplier would be wrong by up to '
+        f'{100.0 * errors[worst, which]:.2g} %. To see slip, {TO_SEE_SLIP[str(one.where)]}'
     )
 
 
@@ -149,123 +230,46 @@ def _thinned(segments: Sequence[Segment], estimate: Estimate) -> tuple[list[Segm
     return thinned, replace(estimate, states=states)
 
 
-def _local(
-    segments: Sequence[Segment],
-    nominal: Geometry,
-    estimate: Estimate,
-    cells: Sequence[NDArray[np.int_]],
-    number: int,
-) -> tuple[Array, Array, Array]:
-    """Return what is known of changes of the logarithms of the multipliers in single cells.
-
-    `cells` are those of each step of each motion, shape (n - 1, any), out of `number`.
-
-    Returns:
-        Their information, shape (n, 3, n, 3), their gradient, shape (n, 3), and the changes of the
-        parameters with them, shape (number of parameters, n, 3).
-    """
-    count = len(estimate.parameters)
-    columns = [count + 3 * one for one in cells]
-    information, gradient = score(segments, nominal, estimate, columns, count + 3 * number)
-    free = np.flatnonzero(estimate.free)
-    known = information[np.ix_(free, free)] + prior_information(estimate.free)
-    cross = information[free, count:]
-    gain = np.linalg.solve(known, np.column_stack([cross, gradient[free]]))
-    moves = np.zeros((count, number, 3))
-    moves[free] = -gain[:, :-1].reshape(-1, number, 3)
-    S = information[count:, count:] - cross.T @ gain[:, :-1]
-    g = gradient[count:] - cross.T @ gain[:, -1]
-    return S.reshape(number, 3, number, 3), g.reshape(number, 3), moves
-
-
-def _windows(
-    segments: Sequence[Segment], nominal: Geometry, offsets: Array
-) -> tuple[list[Window], list[NDArray[np.int_]]]:
-    """Return all windows in their order, and the window of each step of each motion."""
-    paths = []
-    for one in segments:
-        steps = np.abs(np.diff(one.wheel_angles, axis=0)).sum(axis=1) * nominal.wheel_radius
-        path = np.concatenate([[0.0], np.cumsum(steps)])
-        paths.append(np.interp(one.time + offsets[one.recording], one.wheel_time, path))
-    total = sum(float(path[-1] - path[0]) for path in paths)
-    windows: list[Window] = []
-    members = []
-    for one, path in zip(segments, paths, strict=True):
-        share = float(path[-1] - path[0]) / total
-        count = max(1, min(round(WINDOWS * share), len(one.time) // FEWEST))
-        bounds = np.linspace(path[0], path[-1], count + 1)
-        inside = np.searchsorted(bounds[1:-1], (path[1:] + path[:-1]) / 2.0)
-        members.append(len(windows) + inside)
-        times = np.interp(bounds, path, one.time).tolist()
-        windows += [
-            Window(recording=one.recording, begin=begin, end=end, share=share / count, whole=False)
-            for begin, end in pairwise(times)
-        ]
-    return windows, members
-
-
-def _kinds(segment: Segment, offset: float) -> NDArray[np.int_]:
-    """Return to which cell of `KINDS` each step belongs."""
-    middle = (segment.time[1:] + segment.time[:-1]) / 2.0 + offset
-    ends = np.stack([middle - STEADY / 2.0, middle + STEADY / 2.0])
-    right, left = (
-        np.diff(np.interp(ends, segment.wheel_time, segment.wheel_angles[:, side]), axis=0)[0]
-        for side in (0, 1)
+def local_changes(
+    segments: Sequence[Segment], nominal: Geometry, estimate: Estimate, cells: Cells
+) -> LocalChanges:
+    """Return what is known of changes in the cells: further parameters of the linear model."""
+    model = linearized(segments, nominal, estimate)
+    count, steps = len(estimate.parameters), np.arange(len(model.e))
+    in_cells = np.zeros((len(steps), 3, cells.count, 3))
+    for cell in cells.of_steps.T:
+        in_cells[steps, :, cell] = model.D[:, :, MULTIPLIERS]
+    added = 3 * cells.count
+    model = replace(
+        model,
+        D=np.concatenate([model.D, in_cells.reshape(len(steps), 3, added)], axis=2),
+        M=np.pad(model.M, ((0, 0), (0, added))),
+        free=np.append(estimate.free, np.ones(added, dtype=bool)),
+        pull=np.zeros(count + added),
     )
-    forwards, turning = right + left, right - left
-    shape = np.where(np.abs(turning) < CURVED * np.abs(forwards), 0, 2)
-    shape[np.abs(forwards) < CURVED * np.abs(turning)] = 1
-    return np.asarray(np.ravel_multi_index((shape, forwards > 0.0, turning > 0.0), (3, 2, 2)))
+    free = np.flatnonzero(estimate.free)
+    reduced = model.reduced(estimate.noise.variances)
+    own, local = slice(0, len(free)), slice(len(free), None)
+    known = reduced.information[own, own] + prior_information(estimate.free)
+    cross = reduced.information[own, local]
+    gain = np.linalg.solve(known, np.column_stack([cross, reduced.gradient[own]]))
+    moves = np.zeros((count, added))
+    moves[free] = -gain[:, :-1]
+    return LocalChanges(
+        S=reduced.information[local, local] - cross.T @ gain[:, :-1],
+        g=reduced.gradient[local] - cross.T @ gain[:, -1],
+        moves=moves,
+    )
 
 
-def _excess(S: Array, g: Array, windows: int) -> float:
+def _excess(local: LocalChanges, windows: int) -> float:
     """Return how much larger the squares in the median window are than in the model."""
     here = np.arange(windows)
-    prior = np.eye(3) / SPREAD**2
-    solved = np.linalg.solve(S[here, :, here] + prior, np.dstack([S[here, :, here], g[here, :, None]]))
-    squares = np.einsum('ni,ni->n', g[here], solved[:, :, 3])
+    S = local.S.reshape(len(local.g) // 3, 3, -1, 3)[here, :, here]
+    g = local.g.reshape(-1, 3)[here]
+    solved = np.linalg.solve(S + np.eye(3) / DIFFERENCE**2, np.dstack([S, g[:, :, None]]))
+    squares = np.einsum('ni,ni->n', g, solved[:, :, 3])
     freedom = np.trace(solved[:, :, :3], axis1=1, axis2=2)
     # The median of a chi-square distribution of two to three degrees of freedom is 0.75 of its mean.
     excess = float(np.median(squares) / max(np.median(freedom), 1e-9)) / 0.75
     return excess if excess > EXCESS else 1.0
-
-
-def _sets(windows: Sequence[Window], excess: float) -> tuple[Array, Array]:
-    """Return all sets that are compared with the rest: kinds, recordings, consecutive windows.
-
-    Returns:
-        Which cells are in each set, shape (n, cells), and the deviations beyond which it differs not by
-        chance, shape (n,).
-    """
-    count = len(windows)
-    recordings = np.array([one.recording for one in windows])
-    first, last = np.triu_indices(count)
-    here = recordings[first] == recordings[last]
-    first, last = first[here, None], last[here, None]
-    cells = np.arange(count + len(_SHAPE))
-    parts = (cells >= first) & (cells <= last)
-    kinds = np.pad(list(KINDS.values()), ((0, 0), (count, 0)))
-    several = np.unique(recordings)[:, None]
-    whole = np.pad(recordings == several, ((0, 0), (0, len(_SHAPE)))) if len(several) > 1 else kinds[:0]
-    families = ((kinds, 1.0), (whole, 1.0), (parts, excess**0.5))
-    limits = [np.full(len(one), factor * _limit(len(one))) for one, factor in families]
-    return np.concatenate([kinds, whole, parts]).astype(np.float64), np.concatenate(limits)
-
-
-def _window(inside: Array, windows: Sequence[Window]) -> Window | None:
-    """Return the part of a recording that consists of some windows; None: there are none."""
-    chosen = [one for one, here in zip(windows, inside.tolist(), strict=False) if here]
-    if not chosen:
-        return None
-    every = sum(one.recording == chosen[0].recording for one in windows)
-    return replace(
-        chosen[0],
-        end=chosen[-1].end,
-        share=sum(one.share for one in chosen),
-        whole=len(chosen) == every < len(windows),
-    )
-
-
-def _limit(tests: int) -> float:
-    """Return the deviations that the largest of a number of tests exceeds with the chance `CHANCE`."""
-    return NormalDist().inv_cdf(1.0 - CHANCE / (2.0 * len(DIRECTIONS) * max(1, tests)))

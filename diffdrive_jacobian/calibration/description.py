@@ -47,7 +47,7 @@ def tracks(result: Calibration, geometry: Geometry, distance: float) -> list[Tra
     sensor = inverted(result.estimate.sensor)
     found = []
     for segment in result.segments:
-        at = segment.time + result.time_offsets[segment.recording]
+        at = segment.at(result.estimate.parameters)
         moved = increments(segment.wheel_time, segment.wheel_angles, at, geometry)
         reference = composed(segment.poses, sensor)
         travelled = np.concatenate([[0.0], np.cumsum(moved.travel / 2.0)])
@@ -113,13 +113,14 @@ def describe(result: Calibration) -> list[str]:
         f'{correlation[0, 2]:+.2f}, right and separation {correlation[1, 2]:+.2f}'
     )
     lines.append(_sensor(result))
-    full = np.sqrt(np.diag(result.estimate.covariance()))
-    for one, offset, deviation in zip(
-        result.recordings, result.time_offsets.tolist(), full[6:].tolist(), strict=True
-    ):
+    clocks = np.column_stack([result.clocks, result.clock_deviations]).tolist()
+    for one, (offset, drift, deviation, of_drift) in zip(result.recordings, clocks, strict=True):
         if deviation:
-            offset = round(offset, 4) + 0.0
-            lines.append(f'time offset of the reference in {one.name}: {offset:.4f} ± {deviation:.4f} s')
+            offset, drift = round(offset, 4) + 0.0, round(1e6 * drift) + 0.0
+            lines.append(
+                f'clock of the reference in {one.name}: {offset:.4f} ± {deviation:.4f} s early, and '
+                f'{drift:.0f} ± {1e6 * of_drift:.0f} us/s slow'
+            )
     noise = result.estimate.noise
     lines.append(
         f'noise: wheel travel variance {noise.wheel:.3g} m, reference {noise.position:.3g} m and '
@@ -148,7 +149,7 @@ def describe(result: Calibration) -> list[str]:
 
 def _sensor(result: Calibration) -> str:
     values = result.estimate.sensor.tolist()
-    deviations = np.sqrt(np.diag(result.estimate.covariance()))[3:6].tolist()
+    deviations = np.sqrt(np.diag(result.estimate.covariance))[3:6].tolist()
     values[2] = math.remainder(values[2], math.tau)
     values = [round(value, 4) + 0.0 for value in values]  # no negative zeros
     texts = [

@@ -7,12 +7,19 @@ do not fit have no weight.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.calibration.model import Array, CalibrationError, Segment
+from diffdrive_jacobian.calibration.model import (
+    CLOCKS,
+    SENSOR,
+    Array,
+    CalibrationError,
+    Segment,
+    calibrated,
+)
 from diffdrive_jacobian.calibration.motion import (
     Geometry,
     Increments,
@@ -42,31 +49,27 @@ UNITS = {
 """Units of a reference, by how many of them are a metre."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class InitialEstimate:
-    """Approximate parameters."""
+def differences(segment: Segment, nominal: Geometry, parameters: Array) -> tuple[Array, Array]:
+    """Return how steps of the reference differ from those of the wheels, and these distances.
 
-    geometry: Geometry
-    sensor: Array
-    """Pose of the sensor in the body frame, shape (3,)."""
-
-    def differences(self, segment: Segment, time_offset: float) -> tuple[Array, Array]:
-        """Return how steps of the reference differ from those of the wheels, and these distances."""
-        moved = _moved(segment, self.geometry, time_offset)
-        expected = composed(composed(inverted(self.sensor), moved.steps), self.sensor)
-        found = relative(segment.poses[:-1], segment.poses[1:])
-        difference = relative(expected, found)
-        difference[:, 2] = wrap(difference[:, 2])
-        return difference, moved.travel
+    Shapes (n - 1, 3) and (n - 1,).
+    """
+    sensor = parameters[SENSOR]
+    moved = _moved(segment, calibrated(nominal, parameters), parameters)
+    expected = composed(composed(inverted(sensor), moved.steps), sensor)
+    found = relative(segment.poses[:-1], segment.poses[1:])
+    difference = relative(expected, found)
+    difference[:, 2] = wrap(difference[:, 2])
+    return difference, moved.travel
 
 
-def _moved(segment: Segment, geometry: Geometry, offset: float) -> Increments:
-    return increments(segment.wheel_time, segment.wheel_angles, segment.time + offset, geometry)
+def _moved(segment: Segment, geometry: Geometry, parameters: Array) -> Increments:
+    return increments(segment.wheel_time, segment.wheel_angles, segment.at(parameters), geometry)
 
 
-def initial_estimate(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> InitialEstimate:
-    """Return parameters from continuous motions and the time offset of each recording (s)."""
-    parts = [_parts(one, nominal, offsets[one.recording]) for one in segments]
+def initial_estimate(segments: Sequence[Segment], nominal: Geometry, parameters: Array) -> Array:
+    """Return parameters from continuous motions, given those of the clocks."""
+    parts = [_parts(one, nominal, parameters) for one in segments]
     radii, separation = np.array(nominal.radii), nominal.separation
     angles = np.concatenate([angle for angle, _ in parts])
     rims = angles * radii
@@ -89,7 +92,7 @@ def initial_estimate(segments: Sequence[Segment], nominal: Geometry, offsets: Ar
     # From here on the turns of the wheels agree with those of the reference.
     gains = np.clip(gains, 0.05, 20.0)
     turning = replace(nominal, multipliers=(float(gains[1]), float(gains[0]), 1.0))
-    equations = (_positions(one, turning, offsets[one.recording]) for one in segments)
+    equations = (_positions(one, turning, parameters) for one in segments)
     A, b = map(np.concatenate, zip(*equations, strict=True))
     found = _robust(A, b, [1.0, 0.0, 0.0, 0.0], [10.0, 10.0, 1.0, 1.0], 0.01)
     scale = float(np.hypot(*found[:2]))
@@ -102,8 +105,8 @@ def initial_estimate(segments: Sequence[Segment], nominal: Geometry, offsets: Ar
     c, s = np.cos(yaw), np.sin(yaw)
     lever = np.array([[c, -s], [s, c]]) @ found[2:]
     left, right = (float(np.clip(gain * scale, 0.05, 20.0)) for gain in (gains[1], gains[0]))
-    geometry = replace(nominal, multipliers=(left, right, scale))
-    return InitialEstimate(geometry=geometry, sensor=np.array([*lever, yaw]))
+    found = np.array([*np.log([left, right, scale]), *lever, yaw])
+    return np.concatenate([found, parameters[CLOCKS:]])
 
 
 def unit(scale: float) -> str:
@@ -138,11 +141,11 @@ def _ends(travel: Array, separation: float) -> tuple[NDArray[np.intp], NDArray[n
     return bounds[:-1], bounds[1:]
 
 
-def _parts(segment: Segment, nominal: Geometry, offset: float) -> tuple[Array, Array]:
+def _parts(segment: Segment, nominal: Geometry, parameters: Array) -> tuple[Array, Array]:
     """Return the turns of both wheels and of the sensor in each part, shapes (n, 2) and (n,) (rad)."""
-    moved = _moved(segment, nominal, offset)
+    moved = _moved(segment, nominal, parameters)
     first, last = _ends(moved.travel, nominal.separation)
-    at = segment.time + offset
+    at = segment.at(parameters)
     angles = np.column_stack(
         [np.interp(at, segment.wheel_time, segment.wheel_angles[:, side]) for side in (0, 1)]
     )
@@ -152,9 +155,9 @@ def _parts(segment: Segment, nominal: Geometry, offset: float) -> tuple[Array, A
     return angles[last] - angles[first], heading[last] - heading[first]
 
 
-def _positions(segment: Segment, geometry: Geometry, offset: float) -> tuple[Array, Array]:
+def _positions(segment: Segment, geometry: Geometry, parameters: Array) -> tuple[Array, Array]:
     """Return equations for the scale, the yaw offset and the lever arm: `A x = b`."""
-    moved = _moved(segment, geometry, offset)
+    moved = _moved(segment, geometry, parameters)
     first, last = _ends(moved.travel, geometry.separation)
     step = relative(moved.poses[first], moved.poses[last])
     found = relative(segment.poses[first], segment.poses[last])

@@ -50,6 +50,15 @@ class Given:
     heading_noise: float | None = None
     """Standard deviation of the headings, positive (rad)."""
 
+    @property
+    def variances(self) -> Array:
+        """Those of `Noise.variances` that are known, else NaN."""
+        wheel, *deviations = (
+            np.nan if value is None else value
+            for value in (self.wheel_noise, self.position_noise, self.heading_noise)
+        )
+        return np.array([wheel, *np.square(deviations)])
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Noise:
@@ -61,6 +70,17 @@ class Noise:
     """Standard deviation of each coordinate of the positions (m)."""
     heading: float
     """Standard deviation of the headings (rad)."""
+
+    @property
+    def variances(self) -> Array:
+        """Of the motion for a travel of 1 m, of a coordinate and of a heading, shape (3,)."""
+        return np.array([self.wheel, self.position**2, self.heading**2])
+
+    @classmethod
+    def of(cls, variances: Array) -> Noise:
+        """Return the noise with given variances."""
+        wheel, position, heading = variances.tolist()
+        return cls(wheel=wheel, position=position**0.5, heading=heading**0.5)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -74,24 +94,38 @@ class Segment:
     """Most likely angles of the right and the left wheel, shape (m, 2) (rad)."""
     wheel_errors: Array
     """Their standard deviations by the steps of the encoders, shape (m, 2) (rad)."""
+    epoch: float
+    """Time by the clock of the reference at which its offset is estimated (s)."""
     time: Array
-    """Times of the poses, not corrected by the time offset, increasing, shape (n,) (s)."""
+    """Times of the poses by the clock of the reference, increasing, shape (n,) (s)."""
     poses: Array
     """Poses of the sensor, shape (n, 3)."""
     weights: Array = field(default_factory=lambda: np.empty(0))
     """Number of samples that each pose is the mean of, shape (n,)."""
+
+    @property
+    def clock(self) -> slice:
+        """Where the clock of the recording is among the parameters."""
+        return slice(begin := CLOCKS + 2 * self.recording, begin + 2)
+
+    def at(self, parameters: Array) -> Array:
+        """Return the times of the poses by the clock of the wheels (s)."""
+        offset, drift = parameters[self.clock].tolist()
+        return np.asarray(self.time + offset + drift * (self.time - self.epoch))
 
     def part(self, here: slice | NDArray[np.intp]) -> Segment:
         """Return the segment with only some of its poses."""
         return replace(self, time=self.time[here], poses=self.poses[here], weights=self.weights[here])
 
 
-MULTIPLIERS, LEVER_ARM, YAW_OFFSET, TIME_OFFSETS = slice(0, 3), slice(3, 5), 5, 6
+MULTIPLIERS, SENSOR, CLOCKS = slice(0, 3), slice(3, 6), 6
+LEVER_ARM, YAW_OFFSET = slice(3, 5), 5
 """Where the parameters are in their vector: logarithms of the multipliers (left, right, separation), the
-pose of the sensor in the body frame, and the time offset of each recording."""
-SCALES = (0.2, 0.2, 0.2, 0.3, 0.3, 0.5, 0.3)
-"""Prior standard deviations about the approximate parameters (-, m, rad, s). They keep parameters that
-the data do not determine near these, and are without effect on the others."""
+pose of the sensor in the body frame, and for each recording the offset and the drift of its clock."""
+SCALES, CLOCK_SCALES = (0.2, 0.2, 0.2, 0.3, 0.3, 0.5), (0.3, 1e-3)
+"""Prior standard deviations about the approximate parameters (-, m, rad), and of the offset (s) and the
+drift (-) of a clock. They keep parameters that the data do not determine near these, and are without
+effect on the others."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -99,45 +133,41 @@ class Estimate:
     """Parameters of the model and the state of their estimation."""
 
     parameters: Array
-    """As described at `MULTIPLIERS`, shape (6 + number of recordings,)."""
+    """As described at `MULTIPLIERS`, shape (6 + 2 * number of recordings,)."""
     noise: Noise
     free: NDArray[np.bool_]
     """Which of the parameters are estimated, shape as `parameters`."""
     states: tuple[Array, ...] = ()
     """Most likely poses of the body at the times of each segment, shapes (n, 3)."""
-    information: Array
-    """Fisher information of the free parameters."""
+    covariance: Array
+    """Of all parameters, 0 for those that are not free. Directions that the data do not determine have
+    about the variance of `SCALES`."""
 
     def geometry(self, nominal: Geometry) -> Geometry:
         """Return the dimensions of the robot with the estimated multipliers."""
-        left, right, separation = np.exp(self.parameters[MULTIPLIERS]).tolist()
-        return replace(nominal, multipliers=(left, right, separation))
+        return calibrated(nominal, self.parameters)
 
     @property
     def sensor(self) -> Array:
         """Pose of the sensor in the body frame, shape (3,)."""
-        return self.parameters[3:6]
+        return self.parameters[SENSOR]
 
-    def covariance(self) -> Array:
-        """Return the covariance of all parameters, zero for those that are not free.
-
-        Directions that the data do not determine have about the variance of `SCALES`.
-        """
+    def of_free(self, covariance: Array) -> Array:
+        """Return the covariance of all parameters, given that of the free ones."""
         full = np.zeros((len(self.parameters),) * 2)
-        inverse = np.linalg.inv(self.information + prior_information(self.free))
-        full[np.ix_(self.free, self.free)] = (inverse + inverse.T) / 2.0
+        full[np.ix_(self.free, self.free)] = covariance
         return full
 
-    def widened(self, errors: Array) -> Estimate:
-        """Return the estimate with additional errors, shape (any, number of parameters)."""
-        free = np.ix_(self.free, self.free)
-        covariance = self.covariance()[free] + (errors.T @ errors)[free]
-        return replace(self, information=np.linalg.inv(covariance) - prior_information(self.free))
+
+def calibrated(nominal: Geometry, parameters: Array) -> Geometry:
+    """Return the dimensions of the robot with the multipliers among the parameters."""
+    left, right, separation = np.exp(parameters[MULTIPLIERS]).tolist()
+    return replace(nominal, multipliers=(left, right, separation))
 
 
 def prior_deviations(count: int) -> Array:
-    """Return `SCALES` for a number of parameters."""
-    return np.array([*SCALES[:TIME_OFFSETS], *[SCALES[-1]] * (count - TIME_OFFSETS)])
+    """Return the prior standard deviations of a number of parameters."""
+    return np.array([*SCALES, *CLOCK_SCALES * ((count - CLOCKS) // 2)])
 
 
 def prior_information(free: NDArray[np.bool_]) -> Array:

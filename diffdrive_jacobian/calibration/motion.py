@@ -21,9 +21,6 @@ LATERAL = 1e-4
 """Variance of lateral motion relative to that of forward motion; the model itself has none, so that
 the covariance of a short increment would be singular."""
 
-NARROWEST = 1e-7
-"""Shortest window of speeds (s)."""
-
 REST = 1e-6
 """Distance that the wheels travel in each step for the covariance, even at rest (m)."""
 
@@ -71,9 +68,7 @@ class Increments:
     """Sum of the distances that both wheels travel in each step, shape (n - 1,) (m)."""
 
 
-def increments(
-    time: Array, angles: Array, at: Array, geometry: Geometry, window: float = np.inf
-) -> Increments:
+def increments(time: Array, angles: Array, at: Array, geometry: Geometry) -> Increments:
     """Integrate the motion between given times, as exact arcs between the samples of the wheels.
 
     Args:
@@ -81,7 +76,6 @@ def increments(
         angles: Angles of the right and the left wheel there, shape (m, 2) (rad).
         at: Increasing times within those of the wheels, shape (n,), n at least 2 (s).
         geometry: Radii and separation of the wheels.
-        window: Half of the time over which `rates` are means, at most the sample period (s).
     """
     inner = slice(*np.searchsorted(time, [at[0], at[-1]], side='right').tolist())
     knots = np.concatenate([time[inner], at])
@@ -135,7 +129,7 @@ def increments(
         steps=relative(poses[:-1], poses[1:]),
         jacobian=np.moveaxis(sums[:9].reshape(3, 3, -1), (0, 1, 2), (2, 1, 0)),
         covariance=np.moveaxis(symmetric, 2, 0) + least,
-        rates=_rates(time, angles * radius, at, L, window),
+        rates=_rates(time, angles * radius, at, L),
         travel=sums[15],
     )
 
@@ -147,9 +141,12 @@ def _sinc_slope(h: Array) -> Array:
     return np.where(small, -h / 3.0 + h**3 / 30.0, (np.cos(h) - sinc(h)) / safe)
 
 
-def _rates(time: Array, rims: Array, at: Array, L: float, window: float) -> Array:
-    """Return the mean body twist `[v, 0, omega]` about given times, shape (n, 3)."""
-    half = max(min(window, float(np.median(np.diff(time)))), NARROWEST)
+def _rates(time: Array, rims: Array, at: Array, L: float) -> Array:
+    """Return the mean body twist `[v, 0, omega]` about given times, shape (n, 3).
+
+    The mean over two sample periods overlooks the kinks of the angles at the samples.
+    """
+    half = float(np.median(np.diff(time)))
     ends = np.clip(np.stack([at - half, at + half]), time[0], time[-1])
     here = np.stack([np.interp(ends, time, rims[:, side]) for side in (0, 1)])
     right, left = (here[:, 1] - here[:, 0]) / np.maximum(ends[1] - ends[0], 1e-9)

@@ -1,9 +1,4 @@
-"""From recordings to continuous motions: overlap in time, gaps, glitches and jumps of the reference.
-
-The angle of a wheel is its mean given all readings of its encoder. Where the reading is constant for
-long, that is the middle of the step, with the reading error of a uniform distribution. So the error does
-not correlate with the angle, as that of the readings themselves would, which biases the estimate.
-"""
+"""From recordings to continuous motions: overlap in time, gaps, glitches and jumps of the reference."""
 
 from __future__ import annotations
 
@@ -15,76 +10,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.calibration.initial_estimate import InitialEstimate
+from diffdrive_jacobian.calibration.encoders import located
+from diffdrive_jacobian.calibration.initial_estimate import differences
 from diffdrive_jacobian.calibration.model import Array, CalibrationDrive, CalibrationError, Segment
 from diffdrive_jacobian.calibration.motion import Geometry
 from diffdrive_jacobian.numerics.elementary import wrap
-
-INTO_REST = 2.0 / 3.0
-"""Time from a change of the reading to the middle of a step in which the wheel stops, relative to the
-duration of the step before. It is the straight line nearest to the mean of wheels that stop anywhere."""
-LONG = 1.25
-"""Duration of a step in which the wheel stops, relative to those before and after together."""
-PERIOD = 0.025
-"""Period to which the angles are interpolated where they are recorded less often (s)."""
-
-
-def located(time: Array, readings: Array) -> tuple[Array, Array]:
-    """Return the angles of a wheel at the times of its readings, and their standard deviations.
-
-    Readings that change with each sample are returned as they are. The deviation is 0 where the wheel is
-    located between two changes of its reading. Elsewhere, also where the reading changes with each
-    sample, it is that of a step, if the readings show one.
-    """
-    changes = np.flatnonzero(np.diff(readings))
-    first, last = np.append(0, changes + 1), np.append(changes, len(time) - 1)
-    level = readings[first]
-    bounds = np.concatenate([time[:1], (time[changes] + time[changes + 1]) / 2.0, time[-1:]])
-    single = first == last
-    jumps, duration = np.diff(level), np.diff(bounds)
-    steps = np.abs(jumps)[~single[:-1] & ~single[1:]]
-    deviation = float(np.median(steps)) / 12.0**0.5 if len(steps) else 0.0
-    before, after = np.append(0.0, duration[:-1]), np.append(duration[1:], 0.0)
-    stops = single | (duration > LONG * (before + after))
-    # Where the wheel turns back it ends up somewhere within the step, too.
-    stops[1:-1] |= jumps[:-1] * jumps[1:] < 0.0
-    inset = np.concatenate([[0.0], np.where(single, 0.5, INTO_REST) * duration, [0.0]])
-    middle = (time[first] + time[last]) / 2.0
-    begin = np.clip(bounds[:-1] + inset[:-2], time[first], middle)[stops]
-    end = np.clip(bounds[1:] - inset[2:], middle, time[last])[stops]
-    unknown = np.full(len(level), deviation)[stops]
-    knots = np.concatenate([bounds[1:-1], begin, end])
-    angles = np.concatenate([(level[:-1] + level[1:]) / 2.0, level[stops], level[stops]])
-    deviations = np.concatenate([0.0 * jumps, unknown, unknown])
-    order = np.argsort(knots, kind='stable')
-    knots = knots[order]
-    return np.interp(time, knots, angles[order]), np.interp(time, knots, deviations[order])
-
-
-def densified(time: Array, angles: Array) -> tuple[Array, Array]:
-    """Return times at most about `PERIOD` apart and angles there, by monotone cubic interpolation."""
-    parts = max(1, int(np.ceil(float(np.median(np.diff(time))) / PERIOD - 1e-6)))
-    h = np.diff(time)[:, None]
-    speed = np.diff(angles, axis=0) / h
-    # The harmonic mean of the speeds before and after keeps each piece monotone (Fritsch and Butland).
-    before, after = speed[:-1], speed[1:]
-    product = np.maximum(before * after, 0.0)
-    mean = np.where(product > 0.0, 2.0 * product / np.where(product > 0.0, before + after, 1.0), 0.0)
-    slope = np.concatenate([speed[:1], mean, speed[-1:]])
-    first, second = angles[:-1], angles[1:]
-    times, values = [], []
-    for u in (np.arange(parts) / parts).tolist():
-        times.append(time[:-1] + u * h[:, 0])
-        values.append(
-            first
-            + (second - first) * u**2 * (3.0 - 2.0 * u)
-            + h * u * (1.0 - u) * (slope[:-1] * (1.0 - u) - slope[1:] * u)
-        )
-    dense = np.stack(values, axis=1).reshape(-1, 2)
-    return (
-        np.append(np.stack(times, axis=1).reshape(-1), time[-1]),
-        np.concatenate([dense, angles[-1:]]),
-    )
 
 
 def poses_apart(segment: Segment, steps: float) -> int:
@@ -101,9 +31,9 @@ MOST = 25
 """Largest weight of merged poses: the errors of a real reference at rest are not independent."""
 
 
-def merged(segment: Segment, nominal: Geometry, time_offset: float) -> Segment:
+def merged(segment: Segment, nominal: Geometry, parameters: Array) -> Segment:
     """Return a segment in which poses without motion of the wheels between them are averaged."""
-    at = segment.time + time_offset
+    at = segment.at(parameters)
     steps = np.abs(np.diff(segment.wheel_angles, axis=0)).sum(axis=1) * nominal.wheel_radius
     travel = np.concatenate([[0.0], np.cumsum(steps)])
     place = np.floor(np.interp(at, segment.wheel_time, travel) / STILL)
@@ -134,7 +64,7 @@ MOST_SAMPLES, MOST_POSES = 400_000, 10_000
 and memory. Poses at a high rate have little more to say, because their errors depend on each other."""
 STEPS = 2.0
 """Steps of the encoders by which the wheels turn between poses that are used."""
-SLOW = 0.25
+SLOW = 0.15
 """Period of the wheels beyond which too little of the motion is known (s)."""
 FLOORS = np.array([0.03, 0.03, 0.06])
 """Differences that are never taken for a jump (m, m, rad)."""
@@ -143,19 +73,28 @@ SHARES = np.array([0.1, 0.1, 0.5])
 """Allowed difference relative to the distance that the wheels travel (m/m, m/m, rad/m)."""
 GLITCH = 3
 """Number of poses after which a pose that is off is no glitch but a jump."""
-MOST_JUMPS = 0.05
-"""Share of poses at jumps beyond which the reference is refused."""
+MOST_JUMPS = 0.25
+"""Share of glitches and jumps beyond which the reference is refused."""
 
 
 def overlapping(
-    recording: CalibrationDrive, index: int, offset: float, radius: float, smooth: bool = True
+    recording: CalibrationDrive, index: int, parameters: Array, radius: float
 ) -> list[Segment]:
     """Return the continuous motions of a recording: its times in common, split at gaps of the wheels.
 
-    `offset` is added to the times of its poses (s). If `smooth`, the speeds of wheels change gradually
-    between samples; else they are constant.
+    `parameters` have the clock of each recording.
     """
-    wheels, at = recording.wheel_time, recording.pose_time + offset
+    whole = Segment(
+        recording=index,
+        wheel_time=recording.wheel_time,
+        wheel_angles=recording.wheel_angles,
+        wheel_errors=np.zeros_like(recording.wheel_angles),
+        epoch=float(recording.pose_time[[0, -1]].mean()),
+        time=recording.pose_time,
+        poses=recording.poses,
+        weights=np.ones(len(recording.pose_time)),
+    )
+    wheels, at = whole.wheel_time, whole.at(parameters)
     inside = (at >= wheels[0]) & (at <= wheels[-1])
     if not inside.any():
         raise CalibrationError(
@@ -164,32 +103,16 @@ def overlapping(
         )
     steps = np.diff(wheels)
     blind = (steps > max(GAP, 10.0 * float(np.median(steps)))) & (
-        np.abs(np.diff(recording.wheel_angles, axis=0)).max(axis=1) * radius > BLIND
+        np.abs(np.diff(whole.wheel_angles, axis=0)).max(axis=1) * radius > BLIND
     )
     found = []
     bounds = [0, *(np.flatnonzero(blind) + 1).tolist(), len(wheels)]
     for first, last in pairwise(bounds):
-        if last - first < 2:
-            continue
         here = inside & (at >= wheels[first]) & (at <= wheels[last - 1])
-        if np.count_nonzero(here) >= FEWEST:
-            readings = recording.wheel_angles[first:last].T
-            both = [located(wheels[first:last], one) for one in readings]
-            time, angles = wheels[first:last], np.column_stack([angles for angles, _ in both])
-            if smooth:
-                time, angles = densified(time, angles)
-            errors = [np.interp(time, wheels[first:last], deviations) for _, deviations in both]
-            found.append(
-                Segment(
-                    recording=index,
-                    wheel_time=time,
-                    wheel_angles=angles,
-                    wheel_errors=np.column_stack(errors),
-                    time=recording.pose_time[here],
-                    poses=recording.poses[here],
-                    weights=np.ones(int(np.count_nonzero(here))),
-                )
-            )
+        if last - first > 1 and np.count_nonzero(here) >= FEWEST:
+            time, angles, errors = located(wheels[first:last], whole.wheel_angles[first:last])
+            part = whole.part(np.flatnonzero(here))
+            found.append(replace(part, wheel_time=time, wheel_angles=angles, wheel_errors=errors))
     return found
 
 
@@ -260,20 +183,20 @@ def without(segments: Sequence[Segment], recording: int, begin: float, end: floa
 
 
 def without_jumps(
-    segments: Sequence[Segment], found: InitialEstimate, offsets: Array, names: Sequence[str]
+    segments: Sequence[Segment], nominal: Geometry, parameters: Array, names: Sequence[str]
 ) -> tuple[list[Segment], list[str]]:
     """Remove glitches of the reference, split motions at its jumps, and return notes of them."""
     kept: list[Segment] = []
     notes: list[str] = []
     poses = glitches = 0
     jumps: list[tuple[float, float, str]] = []
-    differences = [found.differences(one, offsets[one.recording]) for one in segments]
-    everything = np.concatenate([difference for difference, _ in differences])
+    found = [differences(one, nominal, parameters) for one in segments]
+    everything = np.concatenate([difference for difference, _ in found])
     allowed = FLOORS + SIGMAS * 1.4826 * np.median(np.abs(everything), axis=0)
-    for segment, (difference, travel) in zip(segments, differences, strict=True):
+    for segment, (difference, travel) in zip(segments, found, strict=True):
         poses += len(segment.time)
         off = (np.abs(difference) > allowed + travel[:, None] * SHARES).any(axis=1)
-        use, starts = _followed(segment, found, offsets[segment.recording], off, allowed)
+        use, starts = _followed(segment, nominal, parameters, off, allowed)
         glitches += int(np.count_nonzero(~use))
         for start in starts:
             size = float(np.hypot(*difference[start - 1, :2]))
@@ -305,7 +228,7 @@ def without_jumps(
 
 
 def _followed(
-    segment: Segment, found: InitialEstimate, offset: float, off: NDArray[np.bool_], allowed: Array
+    segment: Segment, nominal: Geometry, parameters: Array, off: NDArray[np.bool_], allowed: Array
 ) -> tuple[NDArray[np.bool_], list[int]]:
     """Return which poses are no glitches, and where the reference continues elsewhere after a jump."""
     use = np.ones(len(segment.time), dtype=bool)
@@ -319,7 +242,7 @@ def _followed(
         last = mark - 1
         for back in range(mark + 1, min(mark + 1 + GLITCH, len(use))):
             pair = np.array([last, back])
-            difference, travel = found.differences(segment.part(pair), offset)
+            difference, travel = differences(segment.part(pair), nominal, parameters)
             if (np.abs(difference) <= allowed + travel[:, None] * SHARES).all():
                 use[mark:back] = False
                 index = back

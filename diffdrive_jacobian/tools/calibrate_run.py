@@ -76,7 +76,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
 
 
 def _print_summary(result: Calibration, read: Sequence[WheelsAndReference]) -> None:
-    for one, offset in zip(read, result.time_offsets.tolist(), strict=True):
+    for one, offset in zip(read, result.clocks[:, 0].tolist(), strict=True):
         recording = one.recording
         begin = max(recording.wheel_time[0], recording.pose_time[0] + offset)
         end = min(recording.wheel_time[-1], recording.pose_time[-1] + offset)

@@ -21,6 +21,7 @@ import numpy as np
 from independent_robots import CASES, cramer_rao_bound, simulate
 
 from diffdrive_jacobian.calibration import CalibrationError, calibrate
+from diffdrive_jacobian.calibration.description import explain_undetermined
 
 BOUNDED = 'UMBmark'
 """Case of which the errors are compared with the Cramer-Rao bound."""
@@ -53,11 +54,16 @@ def one_robot(task: tuple[str, int]) -> Row:
     except CalibrationError as error:
         return {**row, 'refused': str(error), 'seconds': time.process_time() - begin}
     seconds = time.process_time() - begin
+    if found.undetermined:
+        return {**row, 'refused': explain_undetermined(found), 'seconds': seconds}
     scale = np.outer(found.multipliers, found.multipliers)
+    # Where the multipliers change, the error is that of the ones that are farther.
+    errors = np.log(found.multipliers / true)
+    error = errors[np.argmax(np.max(np.abs(errors) / np.sqrt(np.diag(found.covariance)), axis=1))]
     return {
         **row,
         'notes': list(found.notes),
-        'error': np.log(found.multipliers / true).tolist(),
+        'error': error.tolist(),
         'covariance': (found.covariance / scale).tolist(),
         'bound': cramer_rao_bound(case, seed).tolist() if case == BOUNDED else None,
         'seconds': seconds,

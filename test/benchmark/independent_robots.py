@@ -54,6 +54,22 @@ def rounded_square(
     return commands
 
 
+def mixed(
+    laps: int = 1, speed: float = 0.2, turn: float = 1.0, radius: float = 0.25, places: int = 1
+) -> Commands:
+    """Return squares of 1 m in both directions with turns in place at some corners, arcs at the others.
+
+    One turn in place for three arcs is the recipe of doc/calibration.md: slip in either of them shows.
+    """
+    commands: Commands = [(1.0, 0.0, 0.0)]
+    for sign in (-1.0, 1.0):
+        line, stop = (1.0 / speed, speed, 0.0), (0.6, 0.0, 0.0)
+        place = [line, stop, (np.pi / 2 / turn, 0.0, sign * turn), stop]
+        arc = [line, (np.pi / 2 * radius / speed, speed, sign * speed / radius)]
+        commands += (place * places + arc * (4 - places)) * laps
+    return commands
+
+
 def random_arcs(random: np.random.Generator, seconds: float = 100.0) -> Commands:
     """Return arcs of random curvature to both sides."""
     commands: Commands = [(1.0, 0.0, 0.0)]
@@ -83,14 +99,27 @@ class Robot:
     """Unit of the positions of the reference (m)."""
     skids: tuple[bool, ...] = (False,)
     """For each bag whether its right wheel travels 5 % less than it turns for 30 s."""
-    turning_slip: float = 0.0
-    """Share of the travel that both wheels lose while the robot turns."""
+    slip_share: float = 0.0
+    """Share of their travel that some wheels lose in some motion."""
+    slip_wheels: str = 'both'
+    """'both', 'right', or 'outer', the faster one."""
+    slip_motion: str = 'turns'
+    """'turns', 'in place', 'arcs', or 'left', to which the robot turns."""
+    change: tuple[float, float] = (0.0, 0.0)
+    """Relative changes of the left and the right radius in the middle of the drive."""
+    outliers: float = 0.0
+    """Share of poses of the reference that are 0.1 m off in a random direction."""
     swapped: bool = False
     """Whether the wheels are exchanged and count backwards."""
 
 
 STANDARD = Robot(drive=lambda _: square(laps=5), pose_rate=2.0, encoder=None)
 """The robot whose errors are compared with the Cramer-Rao bound."""
+MIXED = Robot(drive=lambda _: mixed(laps=2))
+"""A robot that turns in place and drives arcs, so that slip in one of them shows."""
+FEW_ARCS = Robot(drive=lambda _: mixed(laps=2, radius=0.5, places=2))
+"""A robot whose arcs are too wide, and too few, to show slip in place."""
+SHORT = Robot(drive=lambda _: square(side=1.0), encoder=None)
 
 
 def good(random: np.random.Generator) -> Robot:
@@ -100,9 +129,10 @@ def good(random: np.random.Generator) -> Robot:
         lambda _: square(side, laps),
         lambda _: rounded_square(side, laps, corner=side / 4),
         lambda random: random_arcs(random, 60.0 * laps),
+        lambda _: mixed(laps),
     ]
     return Robot(
-        drive=drives[random.integers(3)],
+        drive=drives[random.integers(4)],
         slip=10.0 ** random.uniform(-6.0, -4.5),
         encoder=[500, 1000, 2048, 4096, None][random.integers(5)],
         wheel_rate=[20.0, 30.0, 50.0, 100.0][random.integers(4)],
@@ -126,6 +156,11 @@ def skidding(random: np.random.Generator) -> Robot:
     return replace(good(random), skids=(True,))
 
 
+def slipping(share: float, wheels: str, motion: str) -> Robot:
+    """Return a robot of which some wheels lose a share of their travel in some motion."""
+    return replace(MIXED, slip_share=share, slip_wheels=wheels, slip_motion=motion)
+
+
 def clock(offset: float) -> Callable[[np.random.Generator], Robot]:
     """Return a draw of robots with an offset of the clocks, on drives of about 100 s or 200 s."""
 
@@ -138,6 +173,7 @@ def clock(offset: float) -> Callable[[np.random.Generator], Robot]:
 
 CASES: dict[str, Robot | Callable[[np.random.Generator], Robot]] = {
     'good': good,
+    'recipe': MIXED,
     'UMBmark': STANDARD,
     **{f'encoder of {n} steps': Robot(encoder=n) for n in (16, 20, 32, 64, 128, 500, 2000)},
     'coarse encoders, varied': coarse,
@@ -145,13 +181,37 @@ CASES: dict[str, Robot | Callable[[np.random.Generator], Robot]] = {
     'skid': Robot(skids=(True,)),
     'skid, fivefold square': Robot(drive=STANDARD.drive, pose_rate=2.0, skids=(True,)),
     'two bags, skid in one': Robot(skids=(False, True)),
-    'slip in tight turns': Robot(drive=lambda _: rounded_square(corner=0.1), turning_slip=0.02),
-    'slip in wide turns': Robot(drive=lambda _: rounded_square(corner=0.5), turning_slip=0.02),
-    'slip while turning in place': Robot(turning_slip=0.02),
+    'slip in tight turns': Robot(drive=lambda _: rounded_square(corner=0.1), slip_share=0.02),
+    'slip in wide turns': Robot(drive=lambda _: rounded_square(corner=0.5), slip_share=0.02),
+    'turns in place only, slip in them': Robot(slip_share=0.02),
+    'right wheel slips 3 % in place': slipping(0.03, 'right', 'in place'),
+    'right wheel slips 5 % in place': slipping(0.05, 'right', 'in place'),
+    'right wheel slips 3 % in place, few arcs': replace(
+        FEW_ARCS, slip_share=0.03, slip_wheels='right', slip_motion='in place'
+    ),
+    'right wheel slips 3 % in left turns': slipping(0.03, 'right', 'left'),
+    'outer wheel slips 1 % in arcs': slipping(0.01, 'outer', 'arcs'),
+    'outer wheel slips 1 % in arcs, no turns in place': Robot(
+        drive=lambda _: rounded_square(), slip_share=0.01, slip_wheels='outer', slip_motion='arcs'
+    ),
+    'radii change by 0.5 %': replace(MIXED, change=(0.005, 0.005)),
+    'a radius changes by 1 %': replace(MIXED, change=(0.0, 0.01)),
+    'a radius changes by 1 %, fivefold square': replace(STANDARD, change=(0.0, 0.01)),
     **{f'clock {offset:+d} s': clock(offset) for offset in (-60, -40, -31, -20, 0, 20, 40, 60)},
     'clock fast by 0.1 %': Robot(clock_drift=1e-3),
+    'clock slow by 0.2 %': replace(MIXED, clock_drift=-2e-3),
+    'outliers of 10 cm, 5 %': replace(MIXED, outliers=0.05),
+    'no noise': replace(MIXED, position_noise=0.0, heading_noise=0.0),
+    'no noise, no slip': replace(MIXED, position_noise=0.0, heading_noise=0.0, slip=0.0),
     'feet': Robot(unit=FOOT),
     'wheels swapped and negated': Robot(swapped=True),
+    'short drive': replace(SHORT, pose_rate=5.0),
+    'short drive, coarse reference': replace(
+        SHORT, pose_rate=5.0, position_noise=0.1, heading_noise=0.1
+    ),
+    'short drive, coarse reference, much slip': replace(
+        SHORT, pose_rate=5.0, position_noise=0.1, heading_noise=0.1, slip=1e-4
+    ),
     **{f'wheels at {n} Hz': Robot(wheel_rate=n) for n in (4, 5, 8, 10, 20)},
 }
 """Robots by the name of the case; functions draw one."""
@@ -160,10 +220,13 @@ CASES: dict[str, Robot | Callable[[np.random.Generator], Robot]] = {
 def simulate(case: str, seed: int) -> tuple[list[CalibrationDrive], Geometry, np.ndarray]:
     """Return recordings of a random robot, its nominal dimensions and its true multipliers.
 
-    The multipliers are those of the left radius, the right radius and the separation.
+    The multipliers are those of the left radius, the right radius and the separation, shape (2, 3): at
+    the begin and at the end.
     """
-    recordings, _, multipliers = _simulated(case, seed)
-    return recordings, Geometry(wheel_radius=RADIUS, wheel_separation=SEPARATION), multipliers
+    recordings, drives, multipliers = _simulated(case, seed)
+    later = multipliers * [*np.add(1.0, drives[0].robot.change), 1.0]
+    nominal = Geometry(wheel_radius=RADIUS, wheel_separation=SEPARATION)
+    return recordings, nominal, np.stack([multipliers, later])
 
 
 def _simulated(case: str, seed: int) -> tuple[list[CalibrationDrive], list[Drive], np.ndarray]:
@@ -216,7 +279,17 @@ class Drive:
         if skid:
             begin = random.uniform(5.0, ends[-1] - 35.0)
             travel[(middle >= begin) & (middle < begin + 30.0), 0] *= 0.95
-        travel[np.abs(omega) > 0.02] *= 1.0 - robot.turning_slip
+        travel[middle > middle[-1] / 2.0] *= np.add(1.0, robot.change)[::-1]
+        turns, drives = np.abs(omega) > 0.02, np.abs(v) > 0.02
+        motions = {'turns': turns, 'in place': turns & ~drives, 'arcs': turns & drives}
+        motions['left'] = omega > 0.02
+        wheels = {
+            'both': np.array([[True, True]]),
+            'right': np.array([[True, False]]),
+            'outer': np.column_stack([omega > 0.0, omega < 0.0]),
+        }
+        slips = wheels[robot.slip_wheels] & motions[robot.slip_motion][:, None]
+        travel[slips] *= 1.0 - robot.slip_share
         travel += np.sqrt(robot.slip * np.abs(travel)) * random.standard_normal(travel.shape)
         self.travel = travel
         forward = travel.mean(axis=1)
@@ -266,6 +339,9 @@ def _recording(
     )
     scale = [robot.position_noise, robot.position_noise, robot.heading_noise]
     poses += scale * random.standard_normal(poses.shape)
+    off = random.uniform(size=len(poses)) < robot.outliers
+    direction = random.uniform(-np.pi, np.pi, len(poses))[off]
+    poses[off, :2] += 0.1 * np.column_stack([np.cos(direction), np.sin(direction)])
     poses[:, :2] /= robot.unit
     poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
     offset = robot.time_offset + random.uniform(-0.05, 0.05)

@@ -123,6 +123,11 @@ def assert_true(result, multipliers=TRUE, most=4.5):
     assert (np.abs(result.multipliers - multipliers) < most * deviations(result)).all()
 
 
+def other_notes(result):
+    """Return the notes, but not that about slip which turns in place alone do not show."""
+    return [note for note in result.notes if 'it would not be noticed that both wheels' not in note]
+
+
 def with_stops(commands, pause=0.6):
     return [one for command in commands for one in (command, (pause, 0.0, 0.0))]
 

@@ -1,0 +1,53 @@
+"""Solves block-tridiagonal equations by cyclic reduction, in a few NumPy calls for each level.
+
+A level eliminates every other block, all of them at once, and half of the blocks remain. So n blocks
+take log2(n) levels and a time proportional to n.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def solve_block_tridiagonal(diagonal: Array, upper: Array, right: Array) -> tuple[Array, float]:
+    """Return the solution x of `A x = b` and log det A, infinite or NaN where A is singular.
+
+    The blocks A[i, i] are `diagonal`, shape (n, 3, 3), the blocks A[i, i + 1] are `upper`, and b and x
+    have shape (n, 3, m); m may be 0. A is symmetric.
+    """
+    levels = []
+    logarithm = 0.0
+    while len(diagonal) > 1:
+        count = len(diagonal)
+        if count % 2 == 0:
+            # An uncoupled block at the end, which is dropped below, gives each odd block two neighbours.
+            diagonal = np.concatenate([diagonal, np.eye(3)[None]])
+            upper = np.concatenate([upper, np.zeros((1, 3, 3))])
+            right = np.concatenate([right, np.zeros((1, *right.shape[1:]))])
+        before, after = np.swapaxes(upper[0::2], 1, 2), upper[1::2]
+        odd = diagonal[1::2]
+        logarithm += float(np.linalg.slogdet(odd)[1].sum())
+        inverse = np.linalg.inv(odd)
+        to_before, to_after = inverse @ before, inverse @ after
+        value = inverse @ right[1::2]
+        levels.append((count, to_before, to_after, value))
+        next_diagonal, next_right = diagonal[0::2].copy(), right[0::2].copy()
+        before_t, after_t = upper[0::2], np.swapaxes(after, 1, 2)
+        next_diagonal[:-1] -= before_t @ to_before
+        next_diagonal[1:] -= after_t @ to_after
+        next_right[:-1] -= before_t @ value
+        next_right[1:] -= after_t @ value
+        kept = (count + 1) // 2
+        upper = (-before_t @ to_after)[: kept - 1]
+        diagonal, right = next_diagonal[:kept], next_right[:kept]
+    logarithm += float(np.linalg.slogdet(diagonal[0])[1])
+    solution = np.linalg.inv(diagonal) @ right
+    for count, to_before, to_after, value in reversed(levels):
+        whole = np.zeros((2 * len(value) + 1, *solution.shape[1:]))
+        whole[0 : 2 * len(solution) : 2] = solution
+        whole[1::2] = value - to_before @ whole[0:-1:2] - to_after @ whole[2::2]
+        solution = whole[:count]
+    return solution, logarithm

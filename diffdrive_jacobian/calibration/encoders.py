@@ -1,0 +1,91 @@
+"""The angle of a wheel from the readings of its encoder, also where its steps or its samples are coarse.
+
+It is the mean given all readings. Where the reading is constant for long, that is the middle of the
+step, with the reading error of a uniform distribution. So the error does not correlate with the angle,
+as that of the readings themselves would, which biases the estimate.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffdrive_jacobian.calibration.model import Array
+
+INTO_REST = 2.0 / 3.0
+"""Time from a change of the reading to the middle of a step in which the wheel stops, relative to the
+duration of the step before. It is the straight line nearest to the mean of wheels that stop anywhere."""
+LONG = 1.25
+"""Duration of a step in which the wheel stops, relative to those before and after together."""
+PERIOD = 0.025
+"""Period to which the angles are interpolated where they are recorded less often (s)."""
+
+
+def located(time: Array, readings: Array) -> tuple[Array, Array, Array]:
+    """Return times at most about `PERIOD` apart, the angles of both wheels, and their deviations.
+
+    Args:
+        time: Times of the readings, shape (m,) (s).
+        readings: Of the right and the left wheel, shape (m, 2) (rad).
+    """
+    both = [between_readings(time, one) for one in readings.T]
+    dense, angles = densified(time, np.column_stack([angles for angles, _ in both]))
+    errors = [np.interp(dense, time, deviations) for _, deviations in both]
+    return dense, angles, np.column_stack(errors)
+
+
+def between_readings(time: Array, readings: Array) -> tuple[Array, Array]:
+    """Return the angles of a wheel at the times of its readings, and their standard deviations.
+
+    Readings that change with each sample are returned as they are. The deviation is 0 where the wheel is
+    located between two changes of its reading. Elsewhere, also where the reading changes with each
+    sample, it is that of a step, if the readings show one.
+    """
+    changes = np.flatnonzero(np.diff(readings))
+    first, last = np.append(0, changes + 1), np.append(changes, len(time) - 1)
+    level = readings[first]
+    bounds = np.concatenate([time[:1], (time[changes] + time[changes + 1]) / 2.0, time[-1:]])
+    single = first == last
+    jumps, duration = np.diff(level), np.diff(bounds)
+    steps = np.abs(jumps)[~single[:-1] & ~single[1:]]
+    deviation = float(np.median(steps)) / 12.0**0.5 if len(steps) else 0.0
+    before, after = np.append(0.0, duration[:-1]), np.append(duration[1:], 0.0)
+    stops = single | (duration > LONG * (before + after))
+    # Where the wheel turns back it ends up somewhere within the step, too.
+    stops[1:-1] |= jumps[:-1] * jumps[1:] < 0.0
+    inset = np.concatenate([[0.0], np.where(single, 0.5, INTO_REST) * duration, [0.0]])
+    middle = (time[first] + time[last]) / 2.0
+    begin = np.clip(bounds[:-1] + inset[:-2], time[first], middle)[stops]
+    end = np.clip(bounds[1:] - inset[2:], middle, time[last])[stops]
+    unknown = np.full(len(level), deviation)[stops]
+    knots = np.concatenate([bounds[1:-1], begin, end])
+    angles = np.concatenate([(level[:-1] + level[1:]) / 2.0, level[stops], level[stops]])
+    deviations = np.concatenate([0.0 * jumps, unknown, unknown])
+    order = np.argsort(knots, kind='stable')
+    knots = knots[order]
+    return np.interp(time, knots, angles[order]), np.interp(time, knots, deviations[order])
+
+
+def densified(time: Array, angles: Array) -> tuple[Array, Array]:
+    """Return times at most about `PERIOD` apart and angles there, by monotone cubic interpolation."""
+    parts = max(1, int(np.ceil(float(np.median(np.diff(time))) / PERIOD - 1e-6)))
+    h = np.diff(time)[:, None]
+    speed = np.diff(angles, axis=0) / h
+    # The harmonic mean of the speeds before and after keeps each piece monotone (Fritsch and Butland).
+    before, after = speed[:-1], speed[1:]
+    product = np.maximum(before * after, 0.0)
+    mean = np.where(product > 0.0, 2.0 * product / np.where(product > 0.0, before + after, 1.0), 0.0)
+    slope = np.concatenate([speed[:1], mean, speed[-1:]])
+    first, second = angles[:-1], angles[1:]
+    times, values = [], []
+    for u in (np.arange(parts) / parts).tolist():
+        times.append(time[:-1] + u * h[:, 0])
+        values.append(
+            first
+            + (second - first) * u**2 * (3.0 - 2.0 * u)
+            + h * u * (1.0 - u) * (slope[:-1] * (1.0 - u) - slope[1:] * u)
+        )
+    dense = np.stack(values, axis=1).reshape(-1, 2)
+    return (
+        np.append(np.stack(times, axis=1).reshape(-1), time[-1]),
+        np.concatenate([dense, angles[-1:]]),
+    )
