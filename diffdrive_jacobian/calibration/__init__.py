@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian import lazy
-from diffdrive_jacobian.calibration.calibrate import PARAMETERS, Calibration, calibrate
+from diffdrive_jacobian.calibration.calibrate import calibrate
 from diffdrive_jacobian.calibration.model import CalibrationDrive, CalibrationError, Given, Noise
 from diffdrive_jacobian.calibration.motion import Geometry
+from diffdrive_jacobian.calibration.result import PARAMETERS, Calibration
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.calibration.data import WheelsAndReference, read_wheels_and_reference

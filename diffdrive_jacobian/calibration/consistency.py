@@ -113,8 +113,8 @@ class Verdict:
     """How it is different."""
     sure: bool
     """Whether that is more than likely."""
-    unnoticed: str
-    """Slip that the drives would not show; '': there is none."""
+    unnoticed: tuple[str, ...]
+    """Slip that the drives would not show."""
     estimate: Estimate
 
 
@@ -166,7 +166,7 @@ def judged(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -
         interval=interval if isinstance(interval, Interval) else None,
         words=words,
         sure=sure,
-        unnoticed='' if slips else _unnoticed(local, every, estimate),
+        unnoticed=() if slips else _unnoticed(local, every, estimate),
         estimate=estimate,
     )
 
@@ -194,14 +194,14 @@ def _averaged(
     )
 
 
-def _unnoticed(local: LocalChanges, every: Sequence[Hypothesis], estimate: Estimate) -> str:
+def _unnoticed(local: LocalChanges, every: Sequence[Hypothesis], estimate: Estimate) -> tuple[str, ...]:
     """Return the slip that would falsify a multiplier by more than stated, and not be noticed.
 
     That is so where a kind of motion has most of what is known of a multiplier.
     """
     found = [one for one in every if one.where in TO_SEE_SLIP and one.what in SLIPS]
     if not found:
-        return ''
+        return ()
     directions = np.stack([one.direction for one in found])
     spreads = np.array([one.spread for one in found])
     least = NOTICED * np.sqrt(local.sizes(directions, spreads)[1])
@@ -209,12 +209,12 @@ def _unnoticed(local: LocalChanges, every: Sequence[Hypothesis], estimate: Estim
     ratios = errors / np.sqrt(np.diag(estimate.covariance)[MULTIPLIERS])
     worst, which = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
     if ratios[worst, which] < HARMFUL:
-        return ''
+        return ()
     one = found[worst]
     return (
         f'where the robot {one.where}, it would not be noticed that {one.what} up to '
         f'{100.0 * least[worst]:.2g} % less: the {NAMES[which]} multiplier would be wrong by up to '
-        f'{100.0 * errors[worst, which]:.2g} %. To see slip, {TO_SEE_SLIP[str(one.where)]}'
+        f'{100.0 * errors[worst, which]:.2g} %. To see slip, {TO_SEE_SLIP[str(one.where)]}',
     )
 
 

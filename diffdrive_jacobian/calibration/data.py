@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections import defaultdict
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -91,102 +90,106 @@ class Samples:
     """Shape (n, k)."""
 
 
-class JointRows:
-    """Messages of the joints, as columns: a bag may have millions of them."""
+class Rows:
+    """Messages of k values as columns: a bag may have millions of them."""
+
+    def __init__(self, width: int) -> None:
+        """Start without messages of `width` values."""
+        self.width = width
+        # Time of recording and stamp of each message, one after the other (ns).
+        self.times: array[int] = array('q')
+        self.values: array[float] = array('d')
+
+    def add(self, received: int, stamp: int, values: Iterable[float]) -> None:
+        """Add a message; without a stamp, 0, its time is that of recording."""
+        self.times.extend((received, stamp or received))
+        self.values.extend(values)
+
+    def samples(self) -> Samples:
+        """Return all messages."""
+        received, stamps = np.frombuffer(self.times, dtype=np.int64).reshape(-1, 2).T
+        values = np.frombuffer(self.values, dtype=np.float64).reshape(-1, self.width)
+        return Samples(received=received, stamps=stamps, values=values)
+
+
+class Joints:
+    """Messages of the joints."""
 
     def __init__(self) -> None:
         """Start without messages."""
-        self.count = 0
-        # Of the messages with the same joints: index of each on its topic, time of recording and stamp
-        # (ns), one after the other; positions; speeds.
-        self.layouts: defaultdict[tuple[str, ...], tuple[array[int], array[float], array[float]]]
-        self.layouts = defaultdict(lambda: (array('q'), array('d'), array('d')))
+        # Positions, then velocities, of the messages with the same joints in the same order.
+        self.rows: dict[tuple[str, ...], Rows] = {}
 
     def add(self, received: int, wheels: Wheels) -> None:
         """Add a message; MessageError if it is invalid."""
         names = wheels.joints
+        unknown = [math.nan] * len(names)
         for values in (wheels.positions, wheels.velocities):
             if len(values) not in (0, len(names)):
                 raise MessageError('joint state must have as many values as names')
-        order, positions, speeds = self.layouts[names]
-        order.extend((self.count, received, wheels.stamp or received))
-        for table, values in ((positions, wheels.positions), (speeds, wheels.velocities)):
-            table.extend(values if len(values) else [math.nan] * len(names))
-        self.count += 1
+        rows = self.rows.setdefault(names, Rows(2 * len(names)))
+        rows.add(
+            received, wheels.stamp, [*(wheels.positions or unknown), *(wheels.velocities or unknown)]
+        )
 
     @property
     def names(self) -> list[str]:
         """Names of the joints, each once."""
-        return list(dict.fromkeys(name for names in self.layouts for name in names))
+        return list(dict.fromkeys(name for names in self.rows for name in names))
 
     def of(self, wheels: tuple[str, str], where: object, topic: str) -> tuple[Samples, bool]:
         """Return angles of right and left wheel, or their speeds, and whether it is these, by joints."""
         left, right = wheels
         for are_speeds in (False, True):
-            orders: list[Any] = [np.empty((0, 3), dtype=np.int64)]
-            values: list[Any] = [np.empty((0, 2))]
-            for names, (indices, *tables) in self.layouts.items():
-                if left not in names or right not in names:
-                    continue
-                table = tables[are_speeds]
-                pairs = _columns(table, len(names))[:, [names.index(right), names.index(left)]]
-                finite = np.isfinite(pairs).all(axis=1)
-                orders.append(np.frombuffer(indices, dtype=np.int64).reshape(-1, 3)[finite])
-                values.append(pairs[finite])
-            order, found = np.concatenate(orders), np.concatenate(values)
-            if len(order) > 1:
-                order, found = order[(rank := np.argsort(order[:, 0]))], found[rank]
-                return Samples(received=order[:, 1], stamps=order[:, 2], values=found), are_speeds
+            found = []
+            for names, rows in self.rows.items():
+                if left in names and right in names:
+                    samples, first = rows.samples(), are_speeds * len(names)
+                    pairs = samples.values[:, [first + names.index(right), first + names.index(left)]]
+                    times = np.column_stack([samples.received, samples.stamps])
+                    finite = np.isfinite(pairs).all(axis=1)
+                    found.append((times[finite], pairs[finite]))
+            if sum(len(pairs) for _, pairs in found) > 1:
+                times, values = map(np.concatenate, zip(*found, strict=True))
+                order = np.argsort(times[:, 0], kind='stable')
+                received, stamps = times[order].T
+                return Samples(received=received, stamps=stamps, values=values[order]), are_speeds
         raise BagError(
             f'{where}: {topic} has less than two messages with finite positions or velocities of '
             f'{quoted(wheels)}'
         )
 
 
-class PoseRows:
+class Poses:
     """Messages of the reference."""
 
     def __init__(self) -> None:
         """Start without messages."""
-        self.count = 0
-        # Time of recording and stamp of each message, one after the other (ns).
-        self.times: array[int] = array('q')
         # x, y, theta, z and tilt of each.
-        self.poses: array[float] = array('d')
+        self.rows = Rows(5)
         self.frames: set[str] = set()
 
     def add(self, received: int, place: SpatialPlace) -> None:
         """Add a message."""
-        self.times.extend((received, place.stamp or received))
-        self.poses.extend((place.x, place.y, place.theta, place.z, place.tilt))
+        self.rows.add(received, place.stamp, (place.x, place.y, place.theta, place.z, place.tilt))
         self.frames.add(place.frame)
-        self.count += 1
 
-    def samples(self) -> Samples:
-        """Return `[x, y, theta]` over time."""
-        received, stamps = np.frombuffer(self.times, dtype=np.int64).reshape(-1, 2).T
-        return Samples(received=received, stamps=stamps, values=_columns(self.poses, 5)[:, :3])
-
-    def check(self, where: object, topic: str) -> None:
-        """Raise BagError if the poses are in several frames, or not in one of the floor."""
+    def of_floor(self, where: object, topic: str) -> Samples:
+        """Return `[x, y, theta]`; BagError if the poses are in several frames, or not in one of a floor."""
         if len(self.frames) > 1:
             raise BagError(
                 f'{where}: the poses on {topic} are in several frames, '
                 f'{quoted(sorted(self.frames))}: one is needed'
             )
-        values = _columns(self.poses, 5)
-        x, y, z = (float(np.ptp(values[:, column])) for column in (0, 1, 3))
-        tilt = float(np.median(values[:, 4]))
+        samples = self.rows.samples()
+        x, y, z = np.ptp(samples.values[:, [0, 1, 3]], axis=0).tolist()
+        tilt = float(np.median(samples.values[:, 4]))
         if tilt > MOST_TILT or (np.isfinite(z) and z > 0.2 and z > 0.5 * max(x, y)):
             raise BagError(
                 f'{where}: the frame of {topic} is not that of a floor with z up: the sensor is tilted '
                 f'by {tilt:.2g} rad and moves by {z:.2g} m in z, {x:.2g} m in x and {y:.2g} m in y'
             )
-
-
-def _columns(table: array[float], width: int) -> Array:
-    """Return a table as rows, shape (n, width)."""
-    return np.frombuffer(table, dtype=np.float64).reshape(-1, width)
+        return replace(samples, values=samples.values[:, :3])
 
 
 def common_clock(
@@ -374,8 +377,8 @@ def read_wheels_and_reference(
         poses_topic = chosen_topic(
             reader, reference, '--reference', 'ground_truth', tuple(POSES), any_name=True
         )
-        joints, poses = JointRows(), PoseRows()
-        sinks: dict[str, JointRows | PoseRows] = {wheels_topic: joints, poses_topic: poses}
+        joints, poses = Joints(), Poses()
+        sinks: dict[str, Joints | Poses] = {wheels_topic: joints, poses_topic: poses}
         kinds: dict[str, Codec[Any]] = {JOINT_STATE.type_name: JOINT_STATE, **POSES}
         codecs = {
             one.id: kinds[one.msgtype]
@@ -389,18 +392,16 @@ def read_wheels_and_reference(
             interrupted,
         )
     where = printable(path, PATH_LIMIT)
-    for topic, count in ((wheels_topic, joints.count), (poses_topic, poses.count)):
-        if not count:
-            found = [*tally.reasons[topic].items()]
-            found += [(MISSING, tally.missing[topic])] if tally.missing[topic] else []
-            reasons = ', '.join(f'{number} {why}' for why, number in found)
+    for topic, found in ((wheels_topic, joints.names), (poses_topic, poses.frames)):
+        if not found:
+            reasons = [f'{number} {why}' for why, number in tally.reasons[topic].items()]
+            reasons += [f'{tally.missing[topic]} {MISSING}'] if tally.missing[topic] else []
             colon = ': ' if reasons else ''
-            raise BagError(f'{where} has no usable message on {topic}{colon}{reasons}')
+            raise BagError(f'{where} has no usable message on {topic}{colon}{", ".join(reasons)}')
     chosen = wheel_names(where, wheels_topic, joints.names, names, parameters)
     measured, from_speeds = joints.of(chosen, where, wheels_topic)
-    poses.check(where, poses_topic)
+    observed = poses.of_floor(where, poses_topic)
     notes = [*tally.notes()]
-    observed = poses.samples()
     wheel_time, pose_time, note = common_clock(measured, observed, wheels_topic, poses_topic)
     notes += [note] if note else []
     origin = min(int(np.min(wheel_time)), int(np.min(pose_time)))

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffdrive_jacobian.calibration.calibrate import PARAMETERS, Calibration
 from diffdrive_jacobian.calibration.model import Array
 from diffdrive_jacobian.calibration.motion import Geometry, composed, increments, inverted, relative
+from diffdrive_jacobian.calibration.result import PARAMETERS, Calibration
 from diffdrive_jacobian.numerics.elementary import wrap
 
 DISTANCE = 5.0
@@ -118,8 +118,8 @@ def describe(result: Calibration) -> list[str]:
         if deviation:
             offset, drift = round(offset, 4) + 0.0, round(1e6 * drift) + 0.0
             lines.append(
-                f'clock of the reference in {one.name}: {offset:.4f} ± {deviation:.4f} s early, and '
-                f'{drift:.0f} ± {1e6 * of_drift:.0f} us/s slow'
+                f'clock of the reference in {one.name}: offset {offset:.4f} ± {deviation:.4f} s, drift '
+                f'{drift:.0f} ± {1e6 * of_drift:.0f} us/s'
             )
     noise = result.estimate.noise
     lines.append(

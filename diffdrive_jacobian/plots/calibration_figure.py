@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diffdrive_jacobian.calibration.calibrate import Calibration
 from diffdrive_jacobian.calibration.description import Track, compared_distance, rms, tracks
+from diffdrive_jacobian.calibration.result import Calibration
 from diffdrive_jacobian.plots.rendering import render, styled
 from diffdrive_jacobian.plots.run_lines import line
 
