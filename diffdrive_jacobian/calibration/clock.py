@@ -8,8 +8,6 @@ repeats itself agrees as well at others: then the one nearest to zero must also 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,45 +35,6 @@ the wheels."""
 REMEDY = 'synchronize the clocks, or give the offset (--time-offset of calibrate_run)'
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Agreement:
-    """How well the speeds of both agree at offsets that increase by equal steps."""
-
-    offsets: Array
-    """Shape (n,) (s)."""
-    overlap: Array
-    """Time that both have in common, shape (n,) (s)."""
-    samples: Array
-    """Number of independent speeds in it, shape (n,)."""
-    searched: NDArray[np.bool_]
-    """Whether the offset may be the one, shape (n,)."""
-    g: Array
-    """0 where it is not searched or may be chance, shape (n,)."""
-
-    def best(self) -> int | None:
-        """Return the index of the largest g; None: no offset explains enough."""
-        largest = int(np.argmax(self.g))
-        return largest if self.g[largest] >= -0.5 * np.log(1.0 - EXPLAINED) else None
-
-    def about_as_good(self, best: int) -> list[int]:
-        """Return the indices of the maxima of g that are as high as the best one, with it."""
-        close = max(0.5 * np.log(ALIKE), EVIDENCE / self.samples[best])
-        least = self.g[best] - close
-        # Between two maxima g is lower by as much.
-        high = np.flatnonzero(self.g > least - close)
-        hills = np.split(high, np.flatnonzero(np.diff(high) > 1) + 1)
-        peaks = [int(hill[np.argmax(self.g[hill])]) for hill in hills]
-        return [peak for peak in peaks if self.g[peak] >= least]
-
-    def refined(self, index: int) -> float:
-        """Return the offset of the maximum of a parabola through g at an index and beside it (s)."""
-        low, middle, high = self.g[index - 1 : index + 2].tolist()
-        bend = low - 2.0 * middle + high
-        shift = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
-        step = float(self.offsets[1] - self.offsets[0])
-        return float(self.offsets[index]) + min(1.0, max(-1.0, shift)) * step
-
-
 def time_offset(recording: CalibrationDrive, nominal: Geometry) -> float | None:
     """Return what must be added to the times of the poses; None: the speeds do not show it.
 
@@ -94,56 +53,55 @@ def time_offset(recording: CalibrationDrive, nominal: Geometry) -> float | None:
     samples = overlap * step / window
     searched = (overlap >= LEAST_OVERLAP * np.max(overlap)) | (np.abs(offsets) <= NEAR)
 
-    def agreement(turning: float) -> Agreement:
-        """Return how the speeds agree if the yaw rates have the same sign, 1, or the other one, -1."""
+    def agreement(turning: float) -> Array:
+        """Return g, 0 where it may be chance, if the yaw rates have the same sign, 1, or another, -1."""
         rho = np.maximum(correlations * [1.0, turning], 0.0)
         g = -0.5 * np.log(1.0 - (1.0 - OFF_AXLE) * rho**2).sum(axis=1)
-        return Agreement(
-            offsets=offsets,
-            overlap=overlap * step,
-            samples=samples,
-            searched=searched,
-            g=np.where(searched & (samples * g >= EVIDENCE), g, 0.0),
-        )
+        return np.where(searched & (samples * g >= EVIDENCE), g, 0.0)
 
-    same = agreement(1.0)
-    largest = same.best()
-    if largest is None:
+    g = agreement(1.0)
+    largest = int(np.argmax(g))
+    if g[largest] < -0.5 * np.log(1.0 - EXPLAINED):
         return None
-    best = _nearest(same, same.about_as_good(largest), recording.name)
-    # Swapped wheels turn the other way. That is reported later, and must not be taken for an offset.
-    turned = agreement(-1.0)
-    other = int(np.argmax(samples * turned.g))
-    if samples[other] * turned.g[other] > samples[best] * same.g[best] and abs(offsets[other]) < abs(
-        offsets[best]
-    ):
-        return float(offsets[other])
-    return same.refined(best)
-
-
-def _nearest(found: Agreement, good: list[int], name: str) -> int:
-    """Return which of some good offsets is meant: the nearest to zero, with the largest overlap."""
-    offsets, step = found.offsets, float(found.offsets[1] - found.offsets[0])
-    widest = max(good, key=lambda index: found.overlap[index])
-    # The overlap of an offset that is not at the maximum changes by a step with each step.
-    loss = {index: (found.overlap[widest] - found.overlap[index]) / step for index in good}
-    fair = [index for index in good if loss[index] <= abs(index - widest) / 2.0]
-    best = min(fair, key=lambda index: abs(offsets[index]))
-    by_distance = sorted(good, key=lambda index: abs(offsets[index]))
-    if by_distance[0] != best:
+    good = _maxima(g, max(0.5 * np.log(ALIKE), EVIDENCE / samples[largest]))
+    widest = max(good, key=lambda index: overlap[index])
+    # Beside the largest overlap, an offset loses up to a row with each step.
+    fair = [one for one in good if overlap[widest] - overlap[one] <= abs(one - widest) / 2.0]
+    best = min(fair, key=lambda one: abs(offsets[one]))
+    nearer = sorted(good, key=lambda one: abs(offsets[one]))
+    if nearer[0] != best:
         listed = ', '.join(
-            f'{offsets[index]:.3f} s (overlap {found.overlap[index]:.0f} s)' for index in by_distance[:4]
+            f'{offsets[one]:.3f} s (overlap {overlap[one] * step:.0f} s)' for one in nearer[:4]
         )
         raise CalibrationError(
-            f'{name}: the motion repeats itself, and the wheels and the reference agree about as well '
-            f'at several time offsets: {listed}: {REMEDY}'
+            f'{recording.name}: the motion repeats itself, and the wheels and the reference agree about '
+            f'as well at several time offsets: {listed}: {REMEDY}'
         )
-    if not found.searched[max(best - 1, 0) : best + 2].all() or best in (0, len(offsets) - 1):
+    if not (searched[max(best - 1, 0)] and searched[min(best + 1, len(g) - 1)]):
         raise CalibrationError(
-            f'{name}: the wheels and the reference agree best at a time offset of {offsets[best]:.3f} '
-            f's, the end of the range that is searched: {REMEDY}'
+            f'{recording.name}: the wheels and the reference agree best at a time offset of '
+            f'{offsets[best]:.3f} s, the end of the range that is searched: {REMEDY}'
         )
-    return best
+    # Swapped wheels turn the other way. That is reported later, and must not be taken for an offset.
+    turned = samples * agreement(-1.0)
+    other = int(np.argmax(turned))
+    swapped = turned[other] > samples[best] * g[best] and abs(offsets[other]) < abs(offsets[best])
+    if swapped:
+        return float(offsets[other])
+    # The maximum of a parabola through g and its neighbours.
+    low, middle, high = g[best - 1 : best + 2].tolist()
+    bend = low - 2.0 * middle + high
+    shift = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
+    return float(offsets[best]) + min(1.0, max(-1.0, shift)) * step
+
+
+def _maxima(g: Array, close: float) -> list[int]:
+    """Return the maxima of g that are as high as the largest but for `close`, with less between them."""
+    least = float(g.max()) - close
+    high = np.flatnonzero(g > least - close)
+    hills = np.split(high, np.flatnonzero(np.diff(high) > 1) + 1)
+    peaks = [int(hill[np.argmax(g[hill])]) for hill in hills]
+    return [peak for peak in peaks if g[peak] >= least]
 
 
 def _correlations(ours: Array, theirs: Array) -> tuple[NDArray[np.int64], Array, Array]:

@@ -175,7 +175,7 @@ class Poses:
         self.frames.add(place.frame)
 
     def of_floor(self, where: object, topic: str) -> Samples:
-        """Return `[x, y, theta]`; BagError if the poses are in several frames, or not in one of a floor."""
+        """Return `[x, y, theta]`; BagError if they are in several frames, or not in one of a floor."""
         if len(self.frames) > 1:
             raise BagError(
                 f'{where}: the poses on {topic} are in several frames, '
