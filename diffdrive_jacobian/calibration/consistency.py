@@ -101,6 +101,11 @@ class LocalChanges:
         )
 
 
+def directions_of(every: Sequence[Hypothesis]) -> Array:
+    """Return the directions of n hypotheses, shape (n, 3 * cells)."""
+    return np.array([one.direction for one in every]).reshape(len(every), -1)
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Verdict:
     """What differs, and the parameters in view of all that may differ."""
@@ -118,79 +123,99 @@ class Verdict:
     estimate: Estimate
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Weighing:
+    """The probabilities of n hypotheses, of which one at most is true, and what they would change."""
+
+    sizes: Array
+    """Most likely sizes of the changes, shape (n,)."""
+    variances: Array
+    """Their variances."""
+    probabilities: Array
+    """Shape (n,). Their sum is less than 1 by that of no change."""
+    right: Array
+    """Probabilities that the multipliers of the part are right, and not those of the rest."""
+    by_rest: Array
+    """What a change of 1 adds to the parameters if the rest is right, shape (n, parameters)."""
+    by_part: Array
+    """What it adds if the part is."""
+
+    @classmethod
+    def of(cls, every: Sequence[Hypothesis], local: LocalChanges, excess: Array) -> Weighing:
+        """Weigh hypotheses. The squares of the changes are divided by `excess`, shape (n,)."""
+        directions = directions_of(every)
+        spreads = np.array([one.spread for one in every])
+        sizes, variances = local.sizes(directions, spreads)
+        bayes = (sizes**2 / variances / excess + np.log(variances / spreads**2)) / 2.0
+        # What the drives do not determine is no reason to doubt the rest.
+        known = local.information(directions) > spreads**-2.0
+        prior = np.where(known, [one.prior for one in every], 0.0)
+        largest = bayes.max(initial=0.0)
+        weights = prior * np.exp(bayes - largest)
+        nothing = (1.0 - prior.sum()) * np.exp(-largest)
+        by_rest = directions @ local.moves.T
+        by_part = by_rest.copy()
+        by_part[:, MULTIPLIERS] += np.array([one.own for one in every]).reshape(-1, 3)
+        return cls(
+            sizes=sizes,
+            variances=variances,
+            probabilities=weights / (weights.sum() + nothing),
+            right=np.array([one.right(size) for one, size in zip(every, sizes.tolist(), strict=True)]),
+            by_rest=by_rest,
+            by_part=by_part,
+        )
+
+    def averaged(self, estimate: Estimate) -> Estimate:
+        """Return the mean of an estimate without a change and of those with one, and its covariance."""
+        shares = np.concatenate(
+            [self.probabilities * (1.0 - self.right), self.probabilities * self.right]
+        )
+        units = np.concatenate([self.by_rest, self.by_part])
+        sizes, variances = np.tile(self.sizes, 2), np.tile(self.variances, 2)
+        mean = (shares * sizes) @ units
+        squares = (units.T * (shares * (sizes**2 + variances))) @ units
+        free = np.ix_(estimate.free, estimate.free)
+        return replace(
+            estimate,
+            parameters=estimate.parameters + mean,
+            covariance=estimate.covariance + estimate.of_free((squares - np.outer(mean, mean))[free]),
+        )
+
+
 def judged(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -> Verdict:
     """Return what differs between parts of the drives, at the most likely parameters."""
     thinned, at = _thinned(segments, estimate)
     cells = divided(thinned, nominal, at.parameters)
     local = local_changes(thinned, nominal, at, cells)
     every = hypotheses(cells)
-    directions = np.array([one.direction for one in every]).reshape(-1, len(local.g))
-    own = np.zeros((len(every), len(at.parameters)))
-    own[:, MULTIPLIERS] = np.array([one.own for one in every]).reshape(-1, 3)
     of_kind = np.array([one.of_kind for one in every], dtype=bool)
-    # What the drives do not determine is no reason to doubt the rest.
-    spreads = np.array([one.spread for one in every])
-    known = local.information(directions) > spreads**-2.0
-    prior = np.where(known, [one.prior for one in every], 0.0)
     excess = np.where(of_kind, 1.0, _excess(local, len(cells.windows)))
     slips: list[str] = []
     while True:
-        sizes, variances = local.sizes(directions, spreads)
-        bayes = (sizes**2 / variances / excess + np.log(variances / spreads**2)) / 2.0
-        weights = prior * np.exp(bayes - bayes.max(initial=0.0))
-        weights /= weights.sum() + (1.0 - prior.sum()) * np.exp(-bayes.max(initial=0.0))
-        right = np.array([one.right(size) for one, size in zip(every, sizes.tolist(), strict=True)])
-        # What a change of 1 adds to the parameters, if the rest is right, and if the part is.
-        by_rest = directions @ local.moves.T
-        by_part = by_rest + own
-        shares = np.concatenate([weights * (1.0 - right), weights * right])
-        units = np.concatenate([by_rest, by_part])
-        estimate = _averaged(estimate, shares, units, np.tile(sizes, 2), np.tile(variances, 2))
-        slipping = float(weights[of_kind].sum())
+        found = Weighing.of(every, local, excess)
+        estimate = found.averaged(estimate)
+        slipping = found.probabilities[of_kind].sum()
         if slipping < LIKELY:
             break
-        slip = int(np.argmax(np.where(of_kind, weights, 0.0)))
-        slips.append(every[slip].words(float(sizes[slip])))
+        slip = int(np.argmax(np.where(of_kind, found.probabilities, 0.0)))
+        size, variance = float(found.sizes[slip]), float(found.variances[slip])
+        slips.append(every[slip].words(size))
         if slipping < SURE or len(slips) == MOST_SLIPS:
             break
-        moved = (by_part if right[slip] else by_rest)[slip]
-        local = local.given(directions[slip], sizes[slip], variances[slip], moved)
-    interval, words, sure = None, '', False
-    if (certainty := float(weights[~of_kind].sum())) > LIKELY:
-        other = int(np.argmax(np.where(of_kind, 0.0, weights)))
-        size = float(sizes[other])
-        interval, words = every[other].where, every[other].words(size)
-        sure = certainty > SURE
+        moved = found.by_part[slip] if found.right[slip] else found.by_rest[slip]
+        local = local.given(every[slip].direction, size, variance, moved)
+    certainty = float(found.probabilities[~of_kind].sum())
+    interval, words = None, ''
+    if certainty > LIKELY:
+        other = int(np.argmax(np.where(of_kind, 0.0, found.probabilities)))
+        interval, words = every[other].where, every[other].words(float(found.sizes[other]))
     return Verdict(
         slips=tuple(slips),
         interval=interval if isinstance(interval, Interval) else None,
         words=words,
-        sure=sure,
+        sure=certainty > SURE,
         unnoticed=() if slips else _unnoticed(local, every, estimate),
         estimate=estimate,
-    )
-
-
-def _averaged(
-    estimate: Estimate, shares: Array, units: Array, sizes: Array, variances: Array
-) -> Estimate:
-    """Return the mean of an estimate and of those with changes, and its covariance.
-
-    Args:
-        estimate: The estimate without a change. It has the share that the others leave.
-        shares: Probabilities of the changes, shape (n,).
-        units: What a change of 1 adds to the parameters, shape (n, parameters).
-        sizes: Sizes of the changes, shape (n,).
-        variances: Their variances, shape (n,).
-    """
-    mean = (shares * sizes) @ units
-    squares = (units.T * (shares * (sizes**2 + variances))) @ units
-    free = estimate.free
-    spread = (squares - np.outer(mean, mean))[np.ix_(free, free)]
-    return replace(
-        estimate,
-        parameters=estimate.parameters + mean,
-        covariance=estimate.covariance + estimate.of_free(spread),
     )
 
 
@@ -202,7 +227,7 @@ def _unnoticed(local: LocalChanges, every: Sequence[Hypothesis], estimate: Estim
     found = [one for one in every if one.where in TO_SEE_SLIP and one.what in SLIPS]
     if not found:
         return ()
-    directions = np.stack([one.direction for one in found])
+    directions = directions_of(found)
     spreads = np.array([one.spread for one in found])
     least = NOTICED * np.sqrt(local.sizes(directions, spreads)[1])
     errors = np.abs(directions @ local.moves[MULTIPLIERS].T) * least[:, None]
