@@ -102,8 +102,8 @@ class LocalChanges:
 
 
 def directions_of(every: Sequence[Hypothesis]) -> Array:
-    """Return the directions of n hypotheses, shape (n, 3 * cells)."""
-    return np.array([one.direction for one in every]).reshape(len(every), -1)
+    """Return the directions of n hypotheses, at least one, shape (n, 3 * cells)."""
+    return np.stack([one.direction for one in every])
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -155,7 +155,7 @@ class Weighing:
         nothing = (1.0 - prior.sum()) * np.exp(-largest)
         by_rest = directions @ local.moves.T
         by_part = by_rest.copy()
-        by_part[:, MULTIPLIERS] += np.array([one.own for one in every]).reshape(-1, 3)
+        by_part[:, MULTIPLIERS] += [one.own for one in every]
         return cls(
             sizes=sizes,
             variances=variances,
@@ -167,9 +167,8 @@ class Weighing:
 
     def averaged(self, estimate: Estimate) -> Estimate:
         """Return the mean of an estimate without a change and of those with one, and its covariance."""
-        shares = np.concatenate(
-            [self.probabilities * (1.0 - self.right), self.probabilities * self.right]
-        )
+        of_part = self.probabilities * self.right
+        shares = np.concatenate([self.probabilities - of_part, of_part])
         units = np.concatenate([self.by_rest, self.by_part])
         sizes, variances = np.tile(self.sizes, 2), np.tile(self.variances, 2)
         mean = (shares * sizes) @ units
@@ -188,6 +187,8 @@ def judged(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -
     cells = divided(thinned, nominal, at.parameters)
     local = local_changes(thinned, nominal, at, cells)
     every = hypotheses(cells)
+    if not every:
+        return Verdict(slips=(), interval=None, words='', sure=False, unnoticed=(), estimate=estimate)
     of_kind = np.array([one.of_kind for one in every], dtype=bool)
     excess = np.where(of_kind, 1.0, _excess(local, len(cells.windows)))
     slips: list[str] = []
