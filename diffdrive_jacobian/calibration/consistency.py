@@ -49,12 +49,7 @@ NOTICED = 4.0
 """Deviations of slip that is noticed."""
 HARMFUL = 4.0
 """Deviations by which slip that is not noticed may falsify a multiplier without a note."""
-TO_SEE_SLIP = {
-    IN_PLACE: 'drive arcs, too',
-    ARCS: 'turn in place, too',
-    'turns left': 'turn to both sides alike',
-    'turns right': 'turn to both sides alike',
-}
+TO_SEE_SLIP = {IN_PLACE: 'drive more arcs', ARCS: 'turn in place, too'}
 """Kinds of motion in which wheels are known to slip, and what shows it."""
 SLIPS = (
     'the left wheel travels',

@@ -291,7 +291,7 @@ def test_slip_that_the_drive_cannot_show_is_said():
     (note,) = calibrate([ROBOT.recording(np.random.default_rng(24))], NOMINAL).notes
     assert re.fullmatch(
         r'where the robot turns in place, it would not be noticed that both wheels travel up to \S+ % '
-        r'less: the separation multiplier would be wrong by up to \S+ %\. To see slip, drive arcs, too',
+        r'less: the separation multiplier would be wrong by up to \S+ %\. To see slip, drive more arcs',
         note,
     )
 
