@@ -232,7 +232,7 @@ def linearized(
         z=residual,
         J=J,
         M=M,
-        samples=np.concatenate([one.weights for one in segments]),
+        samples=np.concatenate([one.samples for one in segments]),
         reading=seen @ np.swapaxes(seen, 1, 2),
         free=estimate.free,
         pull=np.zeros(count) if pull is None else pull,

@@ -100,7 +100,7 @@ class Segment:
     """Times of the poses by the clock of the reference, increasing, shape (n,) (s)."""
     poses: Array
     """Poses of the sensor, shape (n, 3)."""
-    weights: Array = field(default_factory=lambda: np.empty(0))
+    samples: Array = field(default_factory=lambda: np.empty(0))
     """Number of samples that each pose is the mean of, shape (n,)."""
 
     @property
@@ -115,7 +115,7 @@ class Segment:
 
     def part(self, here: slice | NDArray[np.intp]) -> Segment:
         """Return the segment with only some of its poses."""
-        return replace(self, time=self.time[here], poses=self.poses[here], weights=self.weights[here])
+        return replace(self, time=self.time[here], poses=self.poses[here], samples=self.samples[here])
 
 
 MULTIPLIERS, SENSOR, CLOCKS = slice(0, 3), slice(3, 6), 6

@@ -48,7 +48,7 @@ def merged(segment: Segment, nominal: Geometry, parameters: Array) -> Segment:
         segment,
         time=np.add.reduceat(segment.time, starts) / counts,
         poses=means,
-        weights=np.minimum(counts, MOST).astype(np.float64),
+        samples=np.minimum(counts, MOST).astype(np.float64),
     )
 
 
@@ -92,7 +92,7 @@ def overlapping(
         epoch=float(recording.pose_time[[0, -1]].mean()),
         time=recording.pose_time,
         poses=recording.poses,
-        weights=np.ones(len(recording.pose_time)),
+        samples=np.ones(len(recording.pose_time)),
     )
     wheels, at = whole.wheel_time, whole.at(parameters)
     inside = (at >= wheels[0]) & (at <= wheels[-1])

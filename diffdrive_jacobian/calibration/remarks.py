@@ -103,7 +103,7 @@ def _correlation(result: Calibration) -> float:
     first, second = [], []
     for motion, states in zip(result.motions, result.estimate.states, strict=True):
         errors = (motion.poses - composed(states, result.estimate.sensor))[:, :2]
-        single = (motion.weights[1:] == 1.0) & (motion.weights[:-1] == 1.0)
+        single = (motion.samples[1:] == 1.0) & (motion.samples[:-1] == 1.0)
         first.append(errors[:-1][single].ravel())
         second.append(errors[1:][single].ravel())
     a, b = np.concatenate(first), np.concatenate(second)

@@ -144,7 +144,7 @@ def test_information_equals_that_of_a_dense_model(steps):
     J = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
     noise = estimate.noise
     weight = np.diag([noise.position**-2.0] * 2 + [noise.heading**-2.0])
-    normal = sum(w * (J @ one).T @ weight @ (J @ one) for w, one in zip(motion.weights, by, strict=True))
+    normal = sum(w * (J @ one).T @ weight @ (J @ one) for w, one in zip(motion.samples, by, strict=True))
     for i in range(1, n):
         block = slice(3 * i, 3 * i + 3)
         normal[block, block] += np.linalg.inv(found.covariance[i - 1] * noise.wheel)
@@ -238,7 +238,7 @@ def test_several_recordings_count_together_and_their_residuals_follow_each_other
     for part, motion in zip(residuals, result.motions, strict=True):
         np.testing.assert_allclose(np.diff(part[:, 0]), np.diff(motion.time), atol=1e-9)
         # Poses at rest are means of several.
-        squares = motion.weights[:, np.newaxis] * np.square(part[:, 1:])
+        squares = motion.samples[:, np.newaxis] * np.square(part[:, 1:])
         spread = np.sqrt(squares.mean(axis=0)) / [NOISE.position, NOISE.position, NOISE.heading]
         assert ((spread > 0.5) & (spread < 1.3)).all(), spread
 
