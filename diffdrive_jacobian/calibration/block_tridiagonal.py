@@ -13,10 +13,10 @@ Array = NDArray[np.float64]
 
 
 def solve_block_tridiagonal(diagonal: Array, upper: Array, right: Array) -> tuple[Array, float]:
-    """Return the solution x of `A x = b` and log det A, infinite or NaN where A is singular.
+    """Return the solution x of `A x = b` and log det A, for A positive definite.
 
     The blocks A[i, i] are `diagonal`, shape (n, 3, 3), the blocks A[i, i + 1] are `upper`, and b and x
-    have shape (n, 3, m); m may be 0. A is symmetric.
+    have shape (n, 3, m); m may be 0.
     """
     levels = []
     logarithm = 0.0

@@ -135,7 +135,7 @@ def _start(parameters: Array, given: Given) -> Estimate:
         parameters[YAW_OFFSET], free[YAW_OFFSET] = given.yaw_offset, False
     free[CLOCKS:] = given.time_offset is None
     unknown = np.zeros((len(parameters),) * 2)
-    return Estimate(parameters=parameters, noise=START, free=free, covariance=unknown)
+    return Estimate(parameters=parameters, prior=parameters, noise=START, free=free, covariance=unknown)
 
 
 def _estimated(
@@ -152,7 +152,7 @@ def _estimated(
         motions = [one for one in motions if len(one.time) > 1]
         if not motions:
             raise CalibrationError('the wheels never turn')
-        estimate = fit(motions, nominal, estimate, given, start.parameters)
+        estimate = fit(motions, nominal, estimate, given)
         if np.abs(estimate.parameters - before)[CLOCKS::2].max() < SYNCHRONOUS:
             break
     return estimate, motions
@@ -171,7 +171,7 @@ def _consistent(
     while True:
         estimate, motions = _estimated(segments, nominal, start, given)
         verdict = judged(motions, nominal, estimate)
-        part = verdict.interval
+        part = verdict.part
         if part is None:
             break
         words = f'{recordings[part.recording].name}: {verdict.words}'

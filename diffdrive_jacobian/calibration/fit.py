@@ -13,6 +13,7 @@ import numpy as np
 
 from diffdrive_jacobian.calibration.linear_model import LinearModel, Solution, linearized
 from diffdrive_jacobian.calibration.model import (
+    MULTIPLIERS,
     Array,
     CalibrationError,
     Estimate,
@@ -38,31 +39,25 @@ unknown: at 20 Hz and 0.5 m/s^2 it is 0.16 mm, and 1 mrad for a separation of 0.
 LARGEST = Noise(wheel=1.0, position=1e3, heading=1e2)
 LEAST, MOST = SMALLEST.variances, LARGEST.variances
 PRIOR_WHEEL_NOISE, PRIOR_FREEDOM = 1e-5, 1.0
-"""Wheel travel variance that is assumed in advance (m), and how many squares it counts as. In
-short drives with a coarse reference the likelihood alone is largest at zero, where the stated covariance
-would be far too small."""
+"""Wheel travel variance that is assumed in advance (m), about that of a small robot on a hard floor, and
+how many squares it counts as. In short drives with a coarse reference the likelihood alone is largest at
+zero, where the stated covariance would be far too small."""
 
 
-def fit(
-    segments: Sequence[Segment],
-    nominal: Geometry,
-    start: Estimate,
-    given: Given,
-    anchor: Array | None = None,
-) -> Estimate:
+def fit(segments: Sequence[Segment], nominal: Geometry, start: Estimate, given: Given) -> Estimate:
     """Return the most likely parameters of continuous motions of at least two poses each.
 
-    The prior lies about `anchor` (default: the parameters of `start`).
+    Raises:
+        CalibrationError: They do not converge: some multiplier still changes by more than a fifth of its
+            standard deviation.
     """
     sensor = inverted(start.sensor)
     estimate = replace(start, states=tuple(composed(one.poses, sensor) for one in segments))
-    anchor = start.parameters if anchor is None else anchor
-    scales = prior_deviations(len(anchor))
+    scales = prior_deviations(len(start.parameters))
     for _ in range(MAX_STEPS):
-        pull = (estimate.parameters - anchor) / scales**2
-        model = linearized(segments, nominal, estimate, pull)
+        model = linearized(segments, nominal, estimate)
         variances, solution, settled = most_likely_noise(model, estimate.noise.variances, given)
-        change = np.zeros(len(anchor))
+        change = np.zeros(len(scales))
         change[estimate.free] = solution.y
         shorten = float(min(1.0, np.min(scales / np.maximum(np.abs(change), 1e-12))))
         estimate = replace(
@@ -77,7 +72,7 @@ def fit(
         if settled and (shorten * np.abs(change) <= limits).all():
             break
     else:
-        if (np.abs(change[:3]) > deviations[:3] / 5.0).any():
+        if (np.abs(change[MULTIPLIERS]) > deviations[MULTIPLIERS] / 5.0).any():
             raise CalibrationError(
                 f'the estimate does not converge within {MAX_STEPS} steps: the poses of the reference '
                 'do not fit the motion of the wheels'

@@ -1,7 +1,7 @@
 """The model of the calibration, linearized about an estimate, and its most likely unknowns.
 
 The unknowns are a small twist x_i of each pose of the body, in its own frame, and changes y of the
-parameters. Measured minus expected, as twists,
+parameters. The residuals
 
     e_i + x_(i+1) - A_i x_i - D_i y   of the motion between two poses, with the covariance k Q_i
     z_i - J x_i - M y                 of a pose that the reference observes, with the covariance R_i
@@ -78,7 +78,7 @@ class LinearModel:
     """
 
     e: Array
-    """Measured minus expected motion, shape (n - 1, 3)."""
+    """Motion of the estimated poses, seen from that of the wheels, shape (n - 1, 3)."""
     A: Array
     """Adjoints of SE(2): a twist of pose i, in the frame of pose i + 1, shape (n - 1, 3, 3)."""
     D: Array
@@ -92,13 +92,13 @@ class LinearModel:
     M: Array
     """Its derivative by each parameter, shape (3, parameters)."""
     samples: Array
-    """Number of samples that an observed pose is the mean of, shape (n,)."""
+    """Number of samples for which an observed pose counts, shape (n,)."""
     reading: Array
     """What the reading errors of the wheels add to R, shape (n, 3, 3)."""
     free: NDArray[np.bool_]
     """Which of the parameters are estimated, shape (parameters,)."""
-    pull: Array
-    """Gradient of the prior of the parameters, shape (parameters,)."""
+    to_prior: Array
+    """The prior minus the parameters, shape (parameters,)."""
 
     def reduced(self, variances: Array) -> Reduced:
         """Return the equations of the parameters for the variances of `Noise.variances`.
@@ -135,14 +135,15 @@ class LinearModel:
         )
 
     def solved(self, variances: Array) -> Solution:
-        """Return the most likely unknowns for the variances of `Noise.variances`.
+        """Return the most likely unknowns for the variances of `Noise.variances`, given the prior.
 
         Raises:
             CalibrationError: They are not finite.
         """
         reduced = self.reduced(variances)
-        posterior = reduced.information + prior_information(self.free)
-        y = np.asarray(-np.linalg.solve(posterior, reduced.gradient + self.pull[self.free]))
+        prior = prior_information(self.free)
+        posterior = reduced.information + prior
+        y = np.asarray(np.linalg.solve(posterior, prior @ self.to_prior[self.free] - reduced.gradient))
         x = -reduced.by_residuals - reduced.by_parameters @ y
         if not (np.isfinite(y).all() and np.isfinite(x).all()):
             raise CalibrationError(
@@ -158,37 +159,31 @@ class LinearModel:
         return np.asarray(white / self.samples[:, None, None] + self.reading)
 
     def squares_and_freedom(self, variances: Array, solution: Solution) -> tuple[Array, Array]:
-        """Return what is equal where the variances are most likely, shapes (3,).
+        """Return the weighted squares and the degrees of freedom of each noise, shapes (3,).
 
-        For the variances of the motion, the positions and the headings that is the weighted sum of
-        squares that remains, and its degrees of freedom.
+        The noise is that of the motion, the positions and the headings. Both are equal where its
+        variance is most likely: they are the terms of the derivative of the restricted likelihood. Where
+        reading errors add to R, only the part of the noise in a residual counts.
         """
         y = np.zeros(len(self.free))
         y[self.free] = solution.y
         motion = self.e + solution.x[1:] - _times(self.A, solution.x[:-1]) - self.D @ y
         observed = self.z - solution.x @ self.J.T - self.M @ y
         W = np.linalg.inv(self.R(variances))
-        weighted = variances[[1, 1, 2]] / self.samples[:, None] * _times(W, observed) ** 2
-        traces = variances[[1, 1, 2]] / self.samples[:, None] * np.einsum('nii->ni', W)
-        squares = np.array(
-            [
-                np.sum(motion * _times(self.Q_inverse, motion)) / variances[0],
-                weighted[:, :2].sum(),
-                weighted[:, 2].sum(),
-            ]
-        )
-        counts = np.array(
-            [
-                3.0 * np.count_nonzero(self.Q_inverse[:, 0, 0]),
-                traces[:, :2].sum(),
-                traces[:, 2].sum(),
-            ]
-        )
+        white = variances[[1, 1, 2]] / self.samples[:, None]
+        squares = white * _times(W, observed) ** 2
+        counts = white * np.einsum('nii->ni', W)
+        steps = 3.0 * np.count_nonzero(self.Q_inverse[:, 0, 0])
+        of_motion = np.sum(motion * _times(self.Q_inverse, motion)) / variances[0]
         # The unknowns take from each what log det of the normal matrix changes with its weight.
-        h = 1e-3
-        shifted = variances * np.exp(-h * np.eye(3))
-        taken = [(self.solved(one).log_det - solution.log_det) / h for one in shifted]
-        return squares, np.maximum(counts - taken, 1e-3 * counts)
+        change = 1e-3
+        lighter = variances * np.exp(-change * np.eye(3))
+        taken = [(self.solved(one).log_det - solution.log_det) / change for one in lighter]
+        total = np.array([steps, counts[:, :2].sum(), counts[:, 2].sum()])
+        return (
+            np.array([of_motion, squares[:, :2].sum(), squares[:, 2].sum()]),
+            np.maximum(total - taken, 1e-3 * total),
+        )
 
 
 def _times(matrices: NDArray[np.floating], vectors: Array) -> Array:
@@ -200,7 +195,6 @@ def linearized(
     segments: Sequence[Segment],
     nominal: Geometry,
     estimate: Estimate,
-    pull: Array | None = None,
 ) -> LinearModel:
     """Return the model at an estimate."""
     sensor, count = estimate.sensor, len(estimate.parameters)
@@ -235,7 +229,7 @@ def linearized(
         samples=np.concatenate([one.samples for one in segments]),
         reading=seen @ np.swapaxes(seen, 1, 2),
         free=estimate.free,
-        pull=np.zeros(count) if pull is None else pull,
+        to_prior=estimate.prior - estimate.parameters,
     )
 
 

@@ -137,6 +137,8 @@ class Estimate:
     noise: Noise
     free: NDArray[np.bool_]
     """Which of the parameters are estimated, shape as `parameters`."""
+    prior: Array
+    """Where the prior of the parameters lies, shape as `parameters`."""
     states: tuple[Array, ...] = ()
     """Most likely poses of the body at the times of each segment, shapes (n, 3)."""
     covariance: Array
@@ -151,6 +153,17 @@ class Estimate:
     def sensor(self) -> Array:
         """Pose of the sensor in the body frame, shape (3,)."""
         return self.parameters[SENSOR]
+
+    def moved(self, size: float, variance: float, unit: Array) -> Estimate:
+        """Return the estimate with a further parameter.
+
+        `unit` is what a change of 1 of it adds to the others, shape as `parameters`.
+        """
+        return replace(
+            self,
+            parameters=self.parameters + size * unit,
+            covariance=self.covariance + variance * np.outer(unit, unit),
+        )
 
     def of_free(self, covariance: Array) -> Array:
         """Return the covariance of all parameters, given that of the free ones."""

@@ -125,7 +125,7 @@ def assert_true(result, multipliers=TRUE, most=4.5):
 
 def other_notes(result):
     """Return the notes, but not that about slip which turns in place alone do not show."""
-    return [note for note in result.notes if 'it would not be noticed that both wheels' not in note]
+    return [note for note in result.notes if 'it may go unnoticed that both wheels' not in note]
 
 
 def with_stops(commands, pause=0.6):

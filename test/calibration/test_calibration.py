@@ -182,6 +182,7 @@ def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance()
         states = np.column_stack([np.interp(motion.time, SHORT.time, one) for one in truth.T])
         known = Estimate(
             parameters=np.array([*np.log(TRUE), *np.zeros(5)]),
+            prior=np.zeros(8),
             noise=NOISE,
             free=np.ones(8, dtype=bool),
             states=(states,),

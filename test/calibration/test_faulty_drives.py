@@ -213,18 +213,26 @@ def test_the_most_likely_parameters_of_the_rest_are_predicted():
     parameters = np.array([*np.log(TRUE), *np.zeros(5)])
     segments = overlapping(recording, 0, parameters, NOMINAL.wheel_radius)
     start = Estimate(
-        parameters=parameters, noise=NOISE, free=np.arange(8) < 3, covariance=np.zeros((8, 8))
+        parameters=parameters,
+        prior=parameters,
+        noise=NOISE,
+        free=np.arange(8) < 3,
+        covariance=np.zeros((8, 8)),
     )
     together = fit(segments, NOMINAL, start, given)
-    found = judged(segments, NOMINAL, together).interval
+    found = judged(segments, NOMINAL, together).part
     rest = fit(without(segments, 0, found.begin, found.end), NOMINAL, start, given)
     cells = divided(segments, NOMINAL, together.parameters)
     local = local_changes(segments, NOMINAL, together, cells)
     skid = next(
-        one for one in hypotheses(cells) if one.where == found and one.what == 'the right wheel travels'
+        one
+        for one in hypotheses(cells)
+        if (one.part.begin, one.part.end) == (found.begin, found.end)
+        and one.change.words == 'the right wheel travels'
     )
-    (size,), _ = local.sizes(skid.direction[None], np.array([skid.spread]))
-    predicted = together.parameters + local.moves @ skid.direction * size
+    direction = skid.direction(cells.count)
+    (size,), _ = local.sizes(direction[None], np.array([skid.spread]))
+    predicted = together.parameters + local.moves @ direction * size
     deviation = np.sqrt(np.diag(rest.covariance)[:3])
     np.testing.assert_array_less(np.abs(predicted - rest.parameters)[:3], 0.5 * deviation)
     assert np.abs(predicted - together.parameters)[1] > 3.0 * deviation[1]
@@ -290,7 +298,7 @@ def test_slip_that_the_drive_cannot_show_is_said():
     ).notes
     (note,) = calibrate([ROBOT.recording(np.random.default_rng(24))], NOMINAL).notes
     assert re.fullmatch(
-        r'where the robot turns in place, it would not be noticed that both wheels travel up to \S+ % '
+        r'where the robot turns in place, it may go unnoticed that both wheels travel up to \S+ % '
         r'less: the separation multiplier would be wrong by up to \S+ %\. To see slip, drive more arcs',
         note,
     )
