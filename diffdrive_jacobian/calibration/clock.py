@@ -17,21 +17,29 @@ from diffdrive_jacobian.calibration.motion import Geometry
 WINDOW, STEP = 0.5, 0.1
 """Time over which speeds are means, and time between them, at least (s). Robots of this kind change
 their speed within about half a second; the estimate itself corrects an error of some tenths."""
+FEWEST_WINDOWS = 3.0
+"""Shortest recording, in such windows."""
 MOST = 1 << 17
 """Largest number of speeds: four hours. Longer drives have longer steps."""
 LEAST_OVERLAP, NEAR = 0.5, 5.0
 """Overlap, as a share of the shorter recording, up to which offsets are searched, and offset up to which
-they are searched whatever the overlap (s): clocks that agree, in recordings that overlap little."""
-EVIDENCE = 20.0
-"""Log-likelihood ratio below which an agreement may be chance. By chance one offset exceeds it with the
-probability exp(-20) = 2e-9, and one of `MOST` with 3e-4."""
+they are searched whatever the overlap (s): of synchronized computers, with recordings that overlap
+little."""
 EXPLAINED = 0.75
-"""Share of the variance of the speeds that an offset explains at least."""
+"""What an offset explains at least of both speeds, `1 - (1 - rho_v^2) (1 - rho_omega^2)`. Of 150 pairs
+of drives that have nothing to do with each other none reached it."""
+EVIDENCE = 20.0
+"""Least `N g`: 15 s of overlap at least, where an offset explains just enough. It is no probability:
+speeds within seconds depend on each other."""
 ALIKE = 2.0
-"""Ratio of the variances that they do not explain up to which two offsets are about as good."""
+"""Ratio of what they do not explain up to which two offsets are about as good. Laps of a robot differ by
+slip and noise alone, and so by less."""
 OFF_AXLE = 0.01
-"""Share of the variance that is never explained: the speeds of a sensor off the axle are not those of
-the wheels."""
+"""What is never explained: the speeds of a sensor off the axle are not those of the wheels. Without it,
+the best of two nearly perfect agreements would win by rounding errors."""
+OUTLYING = 4.0
+"""Factor of the 95th percentile to which speeds of the reference are limited: one glitch must not
+outweigh the whole drive."""
 REMEDY = 'synchronize the clocks, or give the offset (--time-offset of calibrate_run)'
 
 
@@ -44,55 +52,40 @@ def time_offset(recording: CalibrationDrive, nominal: Geometry) -> float | None:
     wheels, poses = recording.wheel_time, recording.pose_time
     window = max(WINDOW, *(float(np.median(np.diff(time))) for time in (wheels, poses)))
     lengths = float(wheels[-1] - wheels[0]), float(poses[-1] - poses[0])
-    if min(lengths) < 3.0 * window:
+    if min(lengths) < FEWEST_WINDOWS * window:
         return None
     step = max(STEP, max(lengths) / MOST)
     ours, theirs = _wheel_speeds(recording, nominal, step, window), _pose_speeds(recording, step, window)
-    lags, overlap, correlations = _correlations(ours, theirs)
+    lags, overlap, rho = _correlations(ours, theirs)
     offsets = wheels[0] - poses[0] + lags * step
-    samples = overlap * step / window
     searched = (overlap >= LEAST_OVERLAP * np.max(overlap)) | (np.abs(offsets) <= NEAR)
-
-    def agreement(turning: float) -> Array:
-        """Return g, 0 where it may be chance, if the yaw rates have the same sign, 1, or another, -1."""
-        rho = np.maximum(correlations * [1.0, turning], 0.0)
-        g = -0.5 * np.log(1.0 - (1.0 - OFF_AXLE) * rho**2).sum(axis=1)
-        return np.where(searched & (samples * g >= EVIDENCE), g, 0.0)
-
-    g = agreement(1.0)
-    largest = int(np.argmax(g))
-    if g[largest] < -0.5 * np.log(1.0 - EXPLAINED):
+    samples = overlap * step / window
+    # Yaw rates of the same sign agree. Those of swapped wheels have the other one.
+    g, swapped = (
+        np.where(searched & (samples * one >= EVIDENCE), one, 0.0)
+        for one in (_agreement(rho * [1.0, sign]) for sign in (1.0, -1.0))
+    )
+    if g.max() < _agreement(np.array([[EXPLAINED**0.5, 0.0]]))[0]:
         return None
-    good = _maxima(g, max(0.5 * np.log(ALIKE), EVIDENCE / samples[largest]))
-    widest = max(good, key=lambda index: overlap[index])
-    # Beside the largest overlap, an offset loses up to a row with each step.
-    fair = [one for one in good if overlap[widest] - overlap[one] <= abs(one - widest) / 2.0]
-    best = min(fair, key=lambda one: abs(offsets[one]))
-    nearer = sorted(good, key=lambda one: abs(offsets[one]))
-    if nearer[0] != best:
-        listed = ', '.join(
-            f'{offsets[one]:.3f} s (overlap {overlap[one] * step:.0f} s)' for one in nearer[:4]
-        )
-        raise CalibrationError(
-            f'{recording.name}: the motion repeats itself, and the wheels and the reference agree about '
-            f'as well at several time offsets: {listed}: {REMEDY}'
-        )
+    good = _maxima(g, max(0.5 * np.log(ALIKE), EVIDENCE / samples[np.argmax(g)]))
+    best = _meant(good, offsets, overlap * step, step, recording.name)
     if not (searched[max(best - 1, 0)] and searched[min(best + 1, len(g) - 1)]):
         raise CalibrationError(
             f'{recording.name}: the wheels and the reference agree best at a time offset of '
             f'{offsets[best]:.3f} s, the end of the range that is searched: {REMEDY}'
         )
-    # Swapped wheels turn the other way. That is reported later, and must not be taken for an offset.
-    turned = samples * agreement(-1.0)
-    other = int(np.argmax(turned))
-    swapped = turned[other] > samples[best] * g[best] and abs(offsets[other]) < abs(offsets[best])
-    if swapped:
-        return float(offsets[other])
-    # The maximum of a parabola through g and its neighbours.
-    low, middle, high = g[best - 1 : best + 2].tolist()
-    bend = low - 2.0 * middle + high
-    shift = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
-    return float(offsets[best]) + min(1.0, max(-1.0, shift)) * step
+    other = int(np.argmax(samples * swapped))
+    if samples[other] * swapped[other] > samples[best] * g[best]:
+        # Swapped wheels are reported later, and must not be taken for a longer offset.
+        best = min(best, other, key=lambda index: abs(offsets[index]))
+        return float(offsets[best])
+    return float(offsets[best]) + _vertex(g[best - 1 : best + 2]) * step
+
+
+def _agreement(rho: Array) -> Array:
+    """Return g, shape (l,), of correlations, shape (l, k). Negative ones do not agree."""
+    explained = (1.0 - OFF_AXLE) * np.maximum(rho, 0.0) ** 2
+    return np.asarray(-0.5 * np.log(1.0 - explained).sum(axis=1))
 
 
 def _maxima(g: Array, close: float) -> list[int]:
@@ -102,6 +95,35 @@ def _maxima(g: Array, close: float) -> list[int]:
     hills = np.split(high, np.flatnonzero(np.diff(high) > 1) + 1)
     peaks = [int(hill[np.argmax(g[hill])]) for hill in hills]
     return [peak for peak in peaks if g[peak] >= least]
+
+
+def _meant(good: list[int], offsets: Array, overlap: Array, step: float, name: str) -> int:
+    """Return which of some offsets is meant: the nearest to zero, if it has the largest overlap.
+
+    Raises:
+        CalibrationError: A nearer one has a smaller overlap.
+    """
+    nearest = sorted(good, key=lambda index: abs(offsets[index]))
+    widest = max(good, key=lambda index: overlap[index])
+    # The overlap of recordings of the same length falls by a step with each step from the widest, that
+    # of one within the other does not. Half of it tells them apart.
+    fair = abs(nearest[0] - widest) * step / 2.0
+    if overlap[widest] - overlap[nearest[0]] <= fair:
+        return nearest[0]
+    listed = ', '.join(
+        f'{offsets[index]:.3f} s (overlap {overlap[index]:.0f} s)' for index in nearest[:4]
+    )
+    raise CalibrationError(
+        f'{name}: the motion repeats itself, and the wheels and the reference agree about as well at '
+        f'several time offsets: {listed}: {REMEDY}'
+    )
+
+
+def _vertex(values: Array) -> float:
+    """Return where a parabola through three values is largest, from -1 to 1 about the middle one."""
+    low, middle, high = values.tolist()
+    bend = low - 2.0 * middle + high
+    return min(1.0, max(-1.0, 0.5 * (low - high) / bend)) if bend < 0.0 else 0.0
 
 
 def _correlations(ours: Array, theirs: Array) -> tuple[NDArray[np.int64], Array, Array]:
@@ -161,6 +183,5 @@ def _pose_speeds(recording: CalibrationDrive, step: float, window: float) -> Arr
     values = np.column_stack([recording.poses[:, :2], np.unwrap(recording.poses[:, 2])])
     dx, dy, turn = _differences(recording.pose_time, values, step, window).T
     speeds = np.column_stack([np.hypot(dx, dy), turn])
-    # One glitch must not outweigh the whole drive.
-    limits = 4.0 * np.percentile(np.abs(speeds), 95, axis=0) + 1e-9
+    limits = OUTLYING * np.percentile(np.abs(speeds), 95, axis=0) + 1e-9
     return np.asarray(np.clip(speeds, -limits, limits))

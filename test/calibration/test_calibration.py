@@ -28,11 +28,14 @@ from calibration_data import (
 
 from diffdrive_jacobian.calibration import CalibrationError, Given, Noise, calibrate
 from diffdrive_jacobian.calibration.block_tridiagonal import solve_block_tridiagonal
+from diffdrive_jacobian.calibration.clock import time_offset
 from diffdrive_jacobian.calibration.description import explain_undetermined
 from diffdrive_jacobian.calibration.encoders import PERIOD, between_readings, densified
+from diffdrive_jacobian.calibration.fit import fit
 from diffdrive_jacobian.calibration.linear_model import linearized
 from diffdrive_jacobian.calibration.model import Estimate, undetermined
 from diffdrive_jacobian.calibration.motion import composed, increments, inverted, relative
+from diffdrive_jacobian.calibration.preparation import overlapping
 from diffdrive_jacobian.kinematics.se2 import adjoint
 
 # --- Motion
@@ -293,6 +296,17 @@ def test_an_offset_is_refused_where_the_motion_agrees_with_a_nearer_one():
     assert_true(calibrate([recording], NOMINAL, Given(time_offset=delay)))
 
 
+@pytest.mark.parametrize('seed', range(6))
+def test_drives_that_have_nothing_to_do_with_each_other_do_not_agree(seed):
+    random = np.random.default_rng(seed)
+    drives = [
+        [(random.uniform(1, 4), random.uniform(0, 0.3), random.uniform(-1, 1)) for _ in range(40)]
+        for _ in range(2)
+    ]
+    one, other = (replace(ROBOT, drive=Drive.of(commands)).recording(random) for commands in drives)
+    assert time_offset(replace(one, pose_time=other.pose_time, poses=other.poses), NOMINAL) is None
+
+
 def test_a_drive_at_constant_speed_does_not_show_the_offset():
     robot = replace(ROBOT, drive=Drive.of([(40.0, 0.2, 0.5)]), rate=30)
     result = calibrate([robot.recording(np.random.default_rng(12))], NOMINAL)
@@ -359,6 +373,20 @@ def test_wheels_at_4_hz_are_interpolated():
 
 
 # --- What a drive does not determine
+
+
+def test_what_is_not_determined_stays_where_the_prior_is():
+    drive = Drive.of([(1.0, 0.0, 0.0), (8.0, 0.2, 0.0), (1.0, 0.0, 0.0)])
+    recording = replace(ROBOT, drive=drive, rate=10).recording(np.random.default_rng(12))
+    zeros = np.zeros(8)
+    segments = overlapping(recording, 0, zeros, NOMINAL.wheel_radius)
+    prior = np.array([0.0, 0.0, 0.1, *zeros[3:]])
+    free = np.arange(8) < 3
+    start = Estimate(parameters=zeros, prior=prior, noise=NOISE, free=free, covariance=np.zeros((8, 8)))
+    found = fit(segments, NOMINAL, start, Given())
+    assert found.parameters[2] == pytest.approx(0.1, abs=0.01)
+    assert found.covariance[2, 2] ** 0.5 == pytest.approx(0.2, rel=0.1)
+    np.testing.assert_allclose(found.parameters[:2], np.log(TRUE[:2]), atol=0.02)
 
 
 def test_what_is_not_determined_is_named():

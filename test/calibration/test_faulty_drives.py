@@ -248,47 +248,104 @@ def turned(sign):
     return [*LINE, *place, *[*LINE, (quarter / 0.8, 0.2, sign * 0.8)] * 3]
 
 
-BOTH_TURNS = Drive.of([*turned(1.0) * 2, *turned(-1.0) * 2])
+SQUARES = [*turned(1.0) * 2, *turned(-1.0) * 2]
+BOTH_TURNS = Drive.of(SQUARES)
 """Two minutes: turns in place and arcs of 0.25 m, to both sides."""
+BACK_AND_FORTH = [
+    (duration, sign * v, sign * omega)
+    for v, omega in ((0.2, 0.0), (0.2, 0.8), (0.2, 0.0), (0.2, -0.8)) * 3
+    for duration, sign in ((4.0, 1.0), (1.0, 0.0), (4.0, -1.0), (1.0, 0.0))
+]
+"""Lines and arcs, each forth and back."""
 
 
-def slipping(motion, wheels, percent, seed=22):
+def slipping(drive, *slips, seed=22):
     """Return a recording of a robot of which wheels travel less in some motion.
 
     Args:
-        motion: Whether the wheels slip, given the sum and the difference of their steps (rad).
-        wheels: Shares of the slip of the right and the left wheel.
-        percent: How much they slip.
+        drive: The motion of the wheels.
+        slips: Whether wheels slip, given the sum and the difference of their steps (rad), and by how
+            much the right and the left one do (%).
         seed: Of the noise.
     """
-    right, left = np.diff(BOTH_TURNS.angles, axis=0).T
-    when = motion(right + left, right - left)
-    return skidding(
-        BOTH_TURNS, np.random.default_rng(seed), np.multiply(wheels, percent / 4.0), when, rate=10
+    steps = np.diff(drive.angles, axis=0)
+    right, left = steps.T
+    for when, percent in slips:
+        steps = steps * (1.0 - np.outer(when(right + left, right - left), percent) / 100.0)
+    travelled = replace(drive, angles=np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]))
+    robot = replace(ROBOT, drive=travelled, rate=10)
+    return replace(robot.recording(np.random.default_rng(seed)), wheel_angles=drive.angles)
+
+
+def in_place(s, d):
+    return (abs(s) < 1e-9) & (abs(d) > 1e-9)
+
+
+def in_arcs(s, d):
+    return (abs(s) > 1e-9) & (abs(d) > 1e-9)
+
+
+def backwards(s, _):
+    return s < -1e-9
+
+
+def named_slip(note):
+    """Return the motion and the wheel that slips, and by how much (%)."""
+    found = re.fullmatch(
+        r'where the robot (.*), (.*) travels? (\S+) % less than elsewhere: a wheel slips there, and .*',
+        note,
     )
+    return found[1], found[2], float(found[3])
 
 
 @pytest.mark.parametrize(
-    ('motion', 'wheels', 'words'),
+    ('slip', 'expected'),
     [
-        (lambda s, d: (abs(s) < 1e-9) & (abs(d) > 1e-9), [1.0, 0.0], r'turns in place, the right wheel'),
-        (lambda s, d: (abs(s) > 1e-9) & (abs(d) > 1e-9), [1.0, 1.0], r'drives arcs, both wheels'),
-        (lambda s, d: d > 1e-9, [1.0, 0.0], r'turns left, the right wheel'),
-        (lambda s, d: abs(d) > 1e-9, [1.0, 1.0], r'turns, both wheels'),
+        ((in_place, [4.0, 0.0]), ('turns in place', 'the right wheel')),
+        ((in_arcs, [4.0, 4.0]), ('drives arcs', 'both wheels')),
+        ((lambda _, d: d > 1e-9, [4.0, 0.0]), ('turns left', 'the right wheel')),
+        ((lambda _, d: abs(d) > 1e-9, [4.0, 4.0]), ('turns', 'both wheels')),
+        ((backwards, [4.0, 4.0]), ('drives backwards', 'both wheels')),
     ],
-    ids=['in place', 'arcs', 'left', 'turns'],
+    ids=['in place', 'arcs', 'left', 'turns', 'backwards'],
 )
-def test_slip_in_a_kind_of_motion_is_estimated_and_named(motion, wheels, words):
-    result = calibrate([slipping(motion, wheels, 4.0)], NOMINAL)
+def test_slip_in_a_kind_of_motion_is_estimated_and_named(slip, expected):
+    drive = Drive.of(BACK_AND_FORTH) if expected[0] == 'drives backwards' else BOTH_TURNS
+    result = calibrate([slipping(drive, slip)], NOMINAL)
     (note,) = result.notes
-    found = re.fullmatch(
-        rf'where the robot {words} travels? (\S+) % less than elsewhere: a wheel slips there, and .*',
-        note,
-    )
-    assert float(found[1]) == pytest.approx(4.0, abs=1.0)
+    *where, percent = named_slip(note)
+    assert (*where,) == expected
+    assert percent == pytest.approx(4.0, abs=1.0)
     error = np.abs(result.multipliers - TRUE)
     assert (error < 3.0 * deviations(result)).all()
     assert (error[:2] < 0.003).all()
+
+
+def test_slip_in_two_kinds_of_motion_is_named_one_after_the_other():
+    drive = Drive.of([*SQUARES, *BACK_AND_FORTH])
+    result = calibrate([slipping(drive, (in_place, [6.0, 0.0]), (backwards, [3.0, 3.0]))], NOMINAL)
+    found = {named_slip(note)[:2] for note in result.notes}
+    assert found == {('turns in place', 'the right wheel'), ('drives backwards', 'both wheels')}
+    error = np.abs(result.multipliers - TRUE)
+    assert (error < 3.0 * deviations(result)).all()
+    assert (error[:2] < 0.003).all()
+
+
+def test_a_change_that_may_be_chance_makes_the_radii_less_certain():
+    """Of 0.4 % in the middle of the drive."""
+    sound = calibrate([slipping(BOTH_TURNS)], NOMINAL)
+    half = len(BOTH_TURNS.time) // 2
+
+    def later(s, _):
+        return np.arange(len(s)) > half
+
+    widths = []
+    for seed in range(20, 24):
+        result = calibrate([slipping(BOTH_TURNS, (later, [0.4, 0.4]), seed=seed)], NOMINAL)
+        widths.append(deviations(result)[:2] / deviations(sound)[:2])
+        for true in (np.array(TRUE), np.array(TRUE) * [0.996, 0.996, 1.0]):
+            assert (np.abs(result.multipliers - true) < 4.0 * deviations(result)).all()
+    assert np.mean(widths) > 1.3
 
 
 def test_slip_that_the_drive_cannot_show_is_said():
