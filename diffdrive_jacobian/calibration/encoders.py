@@ -1,8 +1,14 @@
 """The angle of a wheel from the readings of its encoder, also where its steps or its samples are coarse.
 
-It is the mean given all readings. Where the reading is constant for long, that is the middle of the
-step, with the reading error of a uniform distribution. So the error does not correlate with the angle,
-as that of the readings themselves would, which biases the estimate.
+It is the mean given all readings: a line through these points, by time and angle.
+
+    moving            halfway between two readings, at the time of the change
+    stopping          in the middle of a step (its reading), some time after the change into it
+    at rest           there
+    starting          there, until as long before the change out of it
+
+At rest the error is that of a uniform distribution within the step. So it does not correlate with the
+angle, as that of the readings themselves would, which biases the estimate.
 """
 
 from __future__ import annotations
