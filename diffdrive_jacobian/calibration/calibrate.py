@@ -9,7 +9,7 @@ import numpy as np
 
 from diffdrive_jacobian.calibration.clock import time_offset
 from diffdrive_jacobian.calibration.consistency import judged
-from diffdrive_jacobian.calibration.fit import fit
+from diffdrive_jacobian.calibration.fit import LARGEST, SMALLEST, fit
 from diffdrive_jacobian.calibration.hypotheses import UNKNOWN
 from diffdrive_jacobian.calibration.initial_estimate import initial_estimate
 from diffdrive_jacobian.calibration.model import (
@@ -59,8 +59,11 @@ def calibrate(
         CalibrationError: The recordings contradict the model, or each other.
     """
     given = given or Given()
+    if not recordings:
+        raise CalibrationError('no recordings')
     for one in recordings:
         _check(one)
+    _check_noise(given)
     recordings = tuple(map(thinned_samples, recordings))
     notes = [note for one in recordings for note in sampling_notes(one)]
     parameters, unknown_clocks = _clocks(recordings, nominal, given)
@@ -87,6 +90,14 @@ def _check(one: CalibrationDrive) -> None:
             raise CalibrationError(f'{one.name}: {what} must be finite')
         if (np.diff(time) <= 0.0).any():
             raise CalibrationError(f'{one.name}: the times of {what} must increase')
+
+
+def _check_noise(given: Given) -> None:
+    for name in ('wheel', 'position', 'heading'):
+        value = getattr(given, f'{name}_noise')
+        least, most = getattr(SMALLEST, name), getattr(LARGEST, name)
+        if value is not None and not least <= value <= most:
+            raise CalibrationError(f'the {name} noise must be from {least:g} to {most:g}, got {value:g}')
 
 
 def _clocks(

@@ -16,6 +16,7 @@ from diffdrive_jacobian.calibration.hypotheses import (
     ARCS,
     DIFFERENCE,
     IN_PLACE,
+    LINES,
     Cells,
     Hypothesis,
     Part,
@@ -25,20 +26,16 @@ from diffdrive_jacobian.calibration.hypotheses import (
 from diffdrive_jacobian.calibration.linear_model import linearized
 from diffdrive_jacobian.calibration.model import (
     MULTIPLIERS,
+    UNDETERMINED,
     Array,
     Estimate,
     Segment,
     prior_information,
 )
 from diffdrive_jacobian.calibration.motion import Geometry
-from diffdrive_jacobian.calibration.preparation import poses_apart
 
 MOST_POSES = 2000
 """Number of poses that are used at most."""
-APART = 20.0
-"""Steps of the encoders by which the wheels turn at least between the poses that are used. Between
-nearer ones much of their turns is reading error, which the score takes for motion that the reference
-lacks."""
 EXCESS = 2.0
 """Ratio of the squares in the median window to those of the model that may be chance. Without a fault it
 is 1.0 with a deviation of 0.28 for 12 windows, and of 0.16 for 40."""
@@ -132,13 +129,16 @@ class Weighing:
         spreads = np.array([one.spread for one in every])
         sizes, variances = local.sizes(directions, spreads)
         bayes = (sizes**2 / variances / excess + np.log(variances / spreads**2)) / 2.0
-        # What the drives do not determine, or no longer, is no reason to doubt the rest.
+        by_rest = directions @ local.moves.T
+        # What the drives do not determine, or no longer, is no reason to doubt the rest, nor is that
+        # given which they do not determine the multipliers.
+        errors = np.abs(by_rest[:, MULTIPLIERS]) * np.sqrt(variances)[:, None]
         known = local.information(directions) > spreads**-2.0
+        known &= (errors < UNDETERMINED).all(axis=1)
         prior = np.where(known, [one.prior for one in every], 0.0)
         largest = bayes.max(initial=0.0)
         weights = prior * np.exp(bayes - largest)
         nothing = (1.0 - prior.sum()) * np.exp(-largest)
-        by_rest = directions @ local.moves.T
         by_part = by_rest.copy()
         by_part[:, MULTIPLIERS] += [one.change.own for one in every]
         return cls(
@@ -202,16 +202,20 @@ def judged(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -
         part=part,
         words=words,
         sure=certainty > SURE,
-        unnoticed=() if slips else _unnoticed(every, found, estimate),
+        unnoticed=() if slips else _unnoticed(cells, every, found, estimate),
         estimate=estimate,
     )
 
 
-def _unnoticed(every: Sequence[Hypothesis], found: Weighing, estimate: Estimate) -> tuple[str, ...]:
+def _unnoticed(
+    cells: Cells, every: Sequence[Hypothesis], found: Weighing, estimate: Estimate
+) -> tuple[str, ...]:
     """Return the slip that may go unnoticed, and falsify a multiplier by more than stated.
 
     That is so where a kind of motion has most of what is known of a multiplier.
     """
+    if cells.lines < LINES:
+        return ('without straight lines, slip in turns would go unnoticed: drive lines, too',)
     least = NOTICED * np.sqrt(found.variances)
     errors = np.abs(found.by_rest[:, MULTIPLIERS]) * least[:, None]
     ratios = errors / np.sqrt(np.diag(estimate.covariance)[MULTIPLIERS])
@@ -229,12 +233,9 @@ def _unnoticed(every: Sequence[Hypothesis], found: Weighing, estimate: Estimate)
 
 
 def _thinned(segments: Sequence[Segment], estimate: Estimate) -> tuple[list[Segment], Estimate]:
-    """Return motions and estimate with at most about `MOST_POSES` poses, `APART` steps apart."""
+    """Return motions and estimate with at most about `MOST_POSES` poses."""
     every = -(-sum(len(one.time) for one in segments) // MOST_POSES)
-    kept = [
-        slice(None, None, min(max(every, poses_apart(one, APART)), len(one.time) - 1))
-        for one in segments
-    ]
+    kept = [slice(None, None, min(every, len(one.time) - 1)) for one in segments]
     states = tuple(one[here] for one, here in zip(estimate.states, kept, strict=True))
     thinned = [one.part(here) for one, here in zip(segments, kept, strict=True)]
     return thinned, replace(estimate, states=states)

@@ -14,6 +14,7 @@ angle, as that of the readings themselves would, which biases the estimate.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diffdrive_jacobian.calibration.model import Array
 
@@ -22,6 +23,9 @@ INTO_REST = 2.0 / 3.0
 duration of the step before. It is the straight line nearest to the mean of wheels that stop anywhere."""
 LONG = 1.25
 """Duration of a step in which the wheel stops, relative to those before and after together."""
+ROUNDED, MULTIPLES, ALTERNATING = 0.1, 0.9, 0.1
+"""How far from a multiple of a step a number is, share of the numbers that are no farther (of any
+numbers it is 0.2), and share of changes that differ by one step from the one before."""
 PERIOD = 0.025
 """Period to which the angles are interpolated where they are recorded less often (s)."""
 
@@ -52,8 +56,7 @@ def between_readings(time: Array, readings: Array) -> tuple[Array, Array]:
     bounds = np.concatenate([time[:1], (time[changes] + time[changes + 1]) / 2.0, time[-1:]])
     single = first == last
     jumps, duration = np.diff(level), np.diff(bounds)
-    steps = np.abs(jumps)[~single[:-1] & ~single[1:]]
-    deviation = float(np.median(steps)) / 12.0**0.5 if len(steps) else 0.0
+    deviation = encoder_step(jumps, ~single[:-1] & ~single[1:]) / 12.0**0.5
     before, after = np.append(0.0, duration[:-1]), np.append(duration[1:], 0.0)
     stops = single | (duration > LONG * (before + after))
     # Where the wheel turns back it ends up somewhere within the step, too.
@@ -69,6 +72,27 @@ def between_readings(time: Array, readings: Array) -> tuple[Array, Array]:
     order = np.argsort(knots, kind='stable')
     knots = knots[order]
     return np.interp(time, knots, angles[order]), np.interp(time, knots, deviations[order])
+
+
+def encoder_step(jumps: Array, repeated: NDArray[np.bool_]) -> float:
+    """Return the step of an encoder, from the changes of its readings; 0: there is none.
+
+    Args:
+        jumps: All changes, shape (n,).
+        repeated: Whether both readings, before and after, stay for several samples, shape (n,).
+    """
+    if repeated.any():
+        return float(np.median(np.abs(jumps[repeated])))
+    # At a constant speed of some steps for each sample, successive changes differ by one step or none.
+    differences = np.abs(np.diff(jumps))
+    differences = differences[differences > 1e-9]
+    if not len(differences):
+        return 0.0
+    step = float(np.min(differences))
+    multiples = np.round(differences / step)
+    of_step = np.abs(differences / step - multiples) < ROUNDED
+    single = np.count_nonzero(of_step & (multiples == 1.0))
+    return step if np.mean(of_step) > MULTIPLES and single > ALTERNATING * len(jumps) else 0.0
 
 
 def densified(time: Array, angles: Array) -> tuple[Array, Array]:

@@ -26,8 +26,9 @@ and more than the periods of wheels and encoders."""
 CURVED = 0.1
 """Ratio of the rotation to the translation of the wheels below which a motion is straight; above the
 inverse it is a turn in place."""
-RARE = 0.01
-"""Share of the distance below which a kind of motion is no part, nor is its complement."""
+RARE, LINES = 0.01, 0.1
+"""Share of the distance below which a kind of motion is no part, and least share of straight lines in
+drives that show slip: without these, a discrepancy of arcs is magnified to multipliers far off."""
 SLIP, OTHER = 0.2, 0.1
 """Prior probability that a wheel slips in a kind of motion, and that there is a change since some time,
 a different interval, and a different recording each. Assumed: one robot of five slips somewhere. Half of
@@ -154,6 +155,11 @@ class Cells:
         """Number of cells."""
         return len(self.windows) + len(SHAPE)
 
+    @property
+    def lines(self) -> float:
+        """Share of the distance on straight lines."""
+        return float(self.travelled[SHAPE == 0].sum())
+
 
 def divided(segments: Sequence[Segment], nominal: Geometry, parameters: Array) -> Cells:
     """Return the cells of the steps of motions. The step from one motion to the next is in any cell."""
@@ -214,7 +220,7 @@ def hypotheses(cells: Cells) -> list[Hypothesis]:
     arcs = [one for one in kinds if one.kind == ARCS]
     slips = [*product(kinds, CHANGES), *product(arcs, CHANGES_OF_ARCS)]
     sorts = (
-        (slips, SLIP, DIFFERENCE),
+        (slips, SLIP if cells.lines > LINES else 0.0, DIFFERENCE),
         (list(product(whole, CHANGES)), OTHER, DIFFERENCE),
         (list(product(since, CHANGES)), OTHER, CHANGE),
         (list(product(intervals, CHANGES)), OTHER, DIFFERENCE),

@@ -18,10 +18,11 @@ from diffdrive_jacobian.numerics.elementary import wrap
 
 
 def poses_apart(segment: Segment, steps: float) -> int:
-    """Return after how many poses, at least 1, the wheels have usually turned by some encoder steps."""
+    """Return after how many poses, at least 1, both wheels have usually turned by some encoder steps."""
     step = 12.0**0.5 * float(np.max(segment.wheel_errors, initial=0.0))
     angles = [np.interp(segment.time, segment.wheel_time, one) for one in segment.wheel_angles.T]
-    turned = float(np.median(np.abs(np.diff(angles)).max(axis=0)))
+    slower = np.abs(np.diff(angles)).min(axis=0)
+    turned = float(np.median(slower[slower > 0.0])) if slower.any() else 0.0
     return max(1, math.ceil(steps * step / turned)) if turned > 0.0 else 1
 
 
@@ -62,8 +63,9 @@ FEWEST_IN_ALL = 10
 MOST_SAMPLES, MOST_POSES = 400_000, 10_000
 """Most samples of a recording that are read, and most poses of all that are estimated: both bound time
 and memory. Poses at a high rate have little more to say, because their errors depend on each other."""
-STEPS = 2.0
-"""Steps of the encoders by which the wheels turn between poses that are used."""
+STEPS = 20.0
+"""Steps of the encoders by which the wheels turn between poses that are used. Between nearer ones much
+of their turns is reading error, and the estimate would take it for motion that the reference lacks."""
 SLOW = 0.15
 """Period of the wheels beyond which too little of the motion is known (s)."""
 FLOORS = np.array([0.03, 0.03, 0.06])

@@ -18,14 +18,15 @@ UNUSUAL = 1.15
 """Factor beyond which multipliers are not explained by manufacturing."""
 LARGE_WHEEL_NOISE = 1e-2
 """Wheel travel variance beyond which the reference does not follow the wheels (m)."""
-NOTABLE_WHEEL_NOISE = 5e-4
+NOTABLE_WHEEL_NOISE = 1e-4
 """Wheel travel variance that is worth a note (m)."""
 EXACT = 2e-5
 """Residual of the positions below which a reference is no observation of a real robot (m)."""
 BACKWARD = 0.6
 """Angle from straight back within which a sensor looks backwards (rad)."""
-LONG_DELAY, NOTABLE_DRIFT = 0.2, 2e-4
-"""Time offset (s) and drift of a clock that are worth a note. Quartz clocks drift by less than 1e-4."""
+LONG_DELAY, NOTABLE_DRIFT, LARGEST_DRIFT = 0.2, 2e-4, 0.02
+"""Time offset (s) and drift of a clock that are worth a note, and a drift that no clock has. That of
+quartz is less than 1e-4."""
 CORRELATED, LEAST_ERRORS = 0.5, 60
 """Correlation of successive errors that is noted, and fewest errors that show it."""
 
@@ -80,8 +81,8 @@ def _of_values(result: Calibration, given: Given) -> list[str]:
         )
     if noise.wheel > NOTABLE_WHEEL_NOISE:
         notes.append(
-            f'the wheels differ from the reference by {apart} after 1 m: they slip, or the '
-            'reference is of another body'
+            f'the wheels differ from the reference by {apart} after 1 m: they slip, '
+            'or the reference is filtered, or of another body'
         )
     if (np.abs(np.log(values)) > np.log(UNUSUAL)).any():
         listed = ', '.join(f'{value:.4g}' for value in values.tolist())
@@ -121,6 +122,11 @@ def _of_clocks(result: Calibration) -> list[str]:
             notes.append(
                 f'{one.name}: the clock of the reference differs by {offset:.3f} s from that '
                 'of the wheels'
+            )
+        if abs(drift) > LARGEST_DRIFT:
+            raise CalibrationError(
+                f'{one.name}: the clock of the reference would drift by {100.0 * abs(drift):.2g} %: is '
+                'it of the same drive as the wheels?'
             )
         if abs(drift) > max(NOTABLE_DRIFT, 4.0 * deviation):
             notes.append(
