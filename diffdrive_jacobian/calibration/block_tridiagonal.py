@@ -27,21 +27,22 @@ def solve_block_tridiagonal(diagonal: Array, upper: Array, right: Array) -> tupl
             diagonal = np.concatenate([diagonal, np.eye(3)[None]])
             upper = np.concatenate([upper, np.zeros((1, 3, 3))])
             right = np.concatenate([right, np.zeros((1, *right.shape[1:]))])
-        before, after = np.swapaxes(upper[0::2], 1, 2), upper[1::2]
+        # Of the odd blocks: those to the left and to the right in their row, and above and below.
+        above, right_of = upper[0::2], upper[1::2]
+        left_of, below = np.swapaxes(above, 1, 2), np.swapaxes(right_of, 1, 2)
         odd = diagonal[1::2]
         logarithm += float(np.linalg.slogdet(odd)[1].sum())
         inverse = np.linalg.inv(odd)
-        to_before, to_after = inverse @ before, inverse @ after
+        to_before, to_after = inverse @ left_of, inverse @ right_of
         value = inverse @ right[1::2]
         levels.append((count, to_before, to_after, value))
         next_diagonal, next_right = diagonal[0::2].copy(), right[0::2].copy()
-        before_t, after_t = upper[0::2], np.swapaxes(after, 1, 2)
-        next_diagonal[:-1] -= before_t @ to_before
-        next_diagonal[1:] -= after_t @ to_after
-        next_right[:-1] -= before_t @ value
-        next_right[1:] -= after_t @ value
+        next_diagonal[:-1] -= above @ to_before
+        next_diagonal[1:] -= below @ to_after
+        next_right[:-1] -= above @ value
+        next_right[1:] -= below @ value
         kept = (count + 1) // 2
-        upper = (-before_t @ to_after)[: kept - 1]
+        upper = (-above @ to_after)[: kept - 1]
         diagonal, right = next_diagonal[:kept], next_right[:kept]
     logarithm += float(np.linalg.slogdet(diagonal[0])[1])
     solution = np.linalg.inv(diagonal) @ right

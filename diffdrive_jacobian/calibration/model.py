@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,8 +100,8 @@ class Segment:
     """Times of the poses by the clock of the reference, increasing, shape (n,) (s)."""
     poses: Array
     """Poses of the sensor, shape (n, 3)."""
-    samples: Array = field(default_factory=lambda: np.empty(0))
-    """Number of samples that each pose is the mean of, shape (n,)."""
+    samples: Array
+    """Number of samples for which each pose counts, shape (n,)."""
 
     @property
     def clock(self) -> slice:

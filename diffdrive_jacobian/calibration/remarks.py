@@ -100,7 +100,10 @@ def _of_values(result: Calibration, given: Given) -> list[str]:
 
 
 def _correlation(result: Calibration) -> float:
-    """Return the correlation of the position errors of successive poses in motion; 0: there are few."""
+    """Return the correlation of the position errors of successive poses in motion; 0: there are few.
+
+    Those at rest are means of several, and a reference without noise has none that could be correlated.
+    """
     first, second = [], []
     for motion, states in zip(result.motions, result.estimate.states, strict=True):
         errors = (motion.poses - composed(states, result.estimate.sensor))[:, :2]

@@ -76,19 +76,14 @@ class Calibration:
         and heading (rad), shape (n, 4). Poses at rest are merged.
         """
         parts: list[Array] = []
-        begin = before = 0.0
-        recording = 0
+        begins: dict[int, float] = {}
         for motion, states in zip(self.motions, self.estimate.states, strict=True):
-            if not parts:
-                begin = -float(motion.time[0])
-            elif motion.recording != recording:
-                # Recordings follow each other, whenever they were made.
-                begin = before - float(motion.time[0])
-            recording = motion.recording
+            # Recordings follow each other, whenever they were made.
+            end = float(parts[-1][-1, 0]) if parts else 0.0
+            begin = begins.setdefault(motion.recording, end - float(motion.time[0]))
             difference = motion.poses - composed(states, self.estimate.sensor)
             difference[:, 2] = wrap(difference[:, 2])
             parts.append(np.column_stack([begin + motion.time, difference]))
-            before = float(parts[-1][-1, 0])
         return parts
 
     @property
