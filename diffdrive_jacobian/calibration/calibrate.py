@@ -9,11 +9,12 @@ import numpy as np
 
 from diffdrive_jacobian.calibration.clock import time_offset
 from diffdrive_jacobian.calibration.consistency import judged
-from diffdrive_jacobian.calibration.fit import LARGEST, SMALLEST, fit
+from diffdrive_jacobian.calibration.fit import fit
 from diffdrive_jacobian.calibration.hypotheses import UNKNOWN
 from diffdrive_jacobian.calibration.initial_estimate import initial_estimate
 from diffdrive_jacobian.calibration.model import (
     CLOCKS,
+    GIVEN_NOISE,
     LEVER_ARM,
     YAW_OFFSET,
     Array,
@@ -93,11 +94,10 @@ def _check(one: CalibrationDrive) -> None:
 
 
 def _check_noise(given: Given) -> None:
-    for name in ('wheel', 'position', 'heading'):
-        value = getattr(given, f'{name}_noise')
-        least, most = getattr(SMALLEST, name), getattr(LARGEST, name)
+    for name, (least, most) in GIVEN_NOISE.items():
+        value = getattr(given, name)
         if value is not None and not least <= value <= most:
-            raise CalibrationError(f'the {name} noise must be from {least:g} to {most:g}, got {value:g}')
+            raise CalibrationError(f'{name} must be from {least:g} to {most:g}, got {value:g}')
 
 
 def _clocks(

@@ -33,6 +33,14 @@ class CalibrationDrive:
     """`[x, y, theta]` of the sensor in the frame of the reference, shape (n, 3)."""
 
 
+GIVEN_NOISE = {
+    'wheel_noise': (1e-9, 1.0),
+    'position_noise': (1e-5, 1e3),
+    'heading_noise': (1e-5, 1e2),
+}
+"""Bounds of a noise that is given (m, m, rad). With less, rounding errors dominate."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Given:
     """Quantities that are known, and so are not estimated. None: estimated."""
@@ -44,11 +52,11 @@ class Given:
     time_offset: float | None = None
     """What must be added to the times of the poses (s)."""
     wheel_noise: float | None = None
-    """Variance of the distance travelled by a wheel, per distance, positive (m)."""
+    """Variance of the distance travelled by a wheel, per distance, within `GIVEN_NOISE` (m)."""
     position_noise: float | None = None
-    """Standard deviation of the positions, positive (m)."""
+    """Standard deviation of the positions, within `GIVEN_NOISE` (m)."""
     heading_noise: float | None = None
-    """Standard deviation of the headings, positive (rad)."""
+    """Standard deviation of the headings, within `GIVEN_NOISE` (rad)."""
 
     @property
     def variances(self) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
@@ -18,6 +18,7 @@ from diffdrive_jacobian.calibration.description import (
     explain_undetermined,
     parameter_file,
 )
+from diffdrive_jacobian.calibration.model import GIVEN_NOISE
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.numerics.checks import between
 from diffdrive_jacobian.plots.calibration_figure import draw
@@ -173,8 +174,8 @@ def _nominal(options: argparse.Namespace, read: Sequence[WheelsAndReference]) ->
     return Geometry(wheel_radius=radius, wheel_separation=separation)
 
 
-_noise = _cli.number_that(between(1e-12, 1e3))
-"""Parses a noise that squares and inverses of floats can represent."""
+def _noise(name: str) -> Callable[[str], float]:
+    return _cli.number_that(between(*GIVEN_NOISE[name]))
 
 
 def _parser() -> _cli.Parser:
@@ -227,9 +228,24 @@ def _parser() -> _cli.Parser:
     for name, unit, kind, text in (
         ('yaw-offset', 'RAD', _cli.angle, 'heading of the sensor in the body frame (rad)'),
         ('time-offset', 'SECONDS', _cli.number, 'added to the times of the reference (s)'),
-        ('wheel-noise', 'M', _noise, 'variance of the distance travelled by a wheel, per distance (m)'),
-        ('position-noise', 'M', _noise, 'standard deviation of the positions of the reference (m)'),
-        ('heading-noise', 'RAD', _noise, 'standard deviation of the headings of the reference (rad)'),
+        (
+            'wheel-noise',
+            'M',
+            _noise('wheel_noise'),
+            'variance of the distance travelled by a wheel, per distance (m)',
+        ),
+        (
+            'position-noise',
+            'M',
+            _noise('position_noise'),
+            'standard deviation of the positions of the reference (m)',
+        ),
+        (
+            'heading-noise',
+            'RAD',
+            _noise('heading_noise'),
+            'standard deviation of the headings of the reference (rad)',
+        ),
     ):
         parser.add_value(f'--{name}', unit, f'{text} (default: estimated)', kind=kind)
     return parser
