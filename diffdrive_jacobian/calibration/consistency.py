@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diffdrive_jacobian.calibration.hypotheses import (
     ARCS,
@@ -43,7 +44,8 @@ LIKELY, SURE = 0.5, 0.9
 """Probability of a change that is named, and of one that is acted on: slip becomes one of the
 parameters, and an interval is left out."""
 NOTICED = 4.0
-"""Deviations of slip up to which it may go unnoticed. At 4 the odds for it are about 10 to 1."""
+"""Deviations of slip up to which it may go unnoticed: there, the odds for it are from even, where it is
+well determined, to 10 to 1."""
 HARMFUL = 4.0
 """Deviations of a multiplier by which slip that goes unnoticed may falsify it without a note."""
 TO_SEE_SLIP = {IN_PLACE: 'drive more arcs', ARCS: 'turn in place, too'}
@@ -92,7 +94,7 @@ class Verdict:
     """What differs, and the parameters in view of all that may differ."""
 
     slips: tuple[str, ...] = ()
-    """Where wheels slip."""
+    """Where wheels slip, and other differences of kinds of motion."""
     part: Part | None = None
     """An interval or a recording that is different; None: all of it may be chance."""
     words: str = ''
@@ -150,6 +152,11 @@ class Weighing:
             by_part=by_part,
         )
 
+    def likeliest(self, which: NDArray[np.bool_]) -> tuple[float, int]:
+        """Return the probability that any of some hypotheses is true, and the likeliest one."""
+        likeliest = int(np.argmax(np.where(which, self.probabilities, -1.0)))
+        return float(self.probabilities[which].sum()), likeliest
+
     def averaged(self, estimate: Estimate) -> Estimate:
         """Return the mean of an estimate without a change and of those with one, and its covariance."""
         of_part = self.probabilities * self.right
@@ -173,38 +180,45 @@ def judged(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -
     every = hypotheses(cells)
     if not every:
         return Verdict(estimate=estimate)
-    directions = np.stack([one.direction(cells.count) for one in every])
     local = local_changes(thinned, nominal, at, cells)
-    excess = _excess(local, len(cells.windows))
+    slips, found, estimate = _with_sure_slips(every, cells, local, estimate)
+    estimate = found.averaged(estimate)
     of_kind = np.array([one.part.kind != '' for one in every])
+    probability, likeliest = found.likeliest(of_kind)
+    if probability > LIKELY:
+        slips.append(every[likeliest].words(float(found.sizes[likeliest])))
+    unnoticed = () if slips else _unnoticed(cells, every, found, estimate)
+    probability, likeliest = found.likeliest(~of_kind)
+    if probability < LIKELY:
+        return Verdict(slips=tuple(slips), unnoticed=unnoticed, estimate=estimate)
+    return Verdict(
+        slips=tuple(slips),
+        part=every[likeliest].part,
+        words=every[likeliest].words(float(found.sizes[likeliest])),
+        sure=probability > SURE,
+        unnoticed=unnoticed,
+        estimate=estimate,
+    )
+
+
+def _with_sure_slips(
+    every: Sequence[Hypothesis], cells: Cells, local: LocalChanges, estimate: Estimate
+) -> tuple[list[str], Weighing, Estimate]:
+    """Return descriptions of slip that is sure, all else in view of it, and the estimate with it."""
+    directions = np.stack([one.direction(cells.count) for one in every])
+    excess = _excess(local, len(cells.windows))
     slips: list[str] = []
+    # It ends: what is one of the parameters is known no better from the rest, and not weighed again.
     while True:
         found = Weighing.of(every, directions, local, excess)
-        slip = int(np.argmax(np.where(of_kind & (found.sizes < 0.0), found.probabilities, 0.0)))
-        if found.probabilities[slip] < SURE:
-            break
-        # It is one of the parameters from here on.
+        slipping = np.array([one.part.kind != '' for one in every]) & (found.sizes < 0.0)
+        slip = int(np.argmax(np.where(slipping, found.probabilities, 0.0)))
+        if not slipping[slip] or found.probabilities[slip] < SURE:
+            return slips, found, estimate
         size, variance = float(found.sizes[slip]), float(found.variances[slip])
         slips.append(every[slip].words(size))
         estimate = estimate.moved(size, variance, found.by_rest[slip])
         local = local.given(directions[slip], size, variance, found.by_rest[slip])
-    estimate = found.averaged(estimate)
-    if found.probabilities[of_kind].sum() > LIKELY:
-        likeliest = int(np.argmax(np.where(of_kind, found.probabilities, 0.0)))
-        slips.append(every[likeliest].words(float(found.sizes[likeliest])))
-    part, words = None, ''
-    certainty = float(found.probabilities[~of_kind].sum())
-    if certainty > LIKELY:
-        likeliest = int(np.argmax(np.where(of_kind, 0.0, found.probabilities)))
-        part, words = every[likeliest].part, every[likeliest].words(float(found.sizes[likeliest]))
-    return Verdict(
-        slips=tuple(slips),
-        part=part,
-        words=words,
-        sure=certainty > SURE,
-        unnoticed=() if slips else _unnoticed(cells, every, found, estimate),
-        estimate=estimate,
-    )
 
 
 def _unnoticed(

@@ -7,8 +7,10 @@ It is the mean given all readings: a line through these points, by time and angl
     at rest           there
     starting          there, until as long before the change out of it
 
-At rest the error is that of a uniform distribution within the step. So it does not correlate with the
-angle, as that of the readings themselves would, which biases the estimate.
+    turning by more than a step from sample to sample: the reading
+
+At rest, and where the reading changes with each sample, the error is that of a uniform distribution
+within the step. At rest it does not correlate with the angle, as that of the readings themselves would.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from diffdrive_jacobian.calibration.model import Array, Segment
 from diffdrive_jacobian.calibration.motion import Geometry
 
 WINDOWS = 40
-"""Number of windows of equal distances into which all drives are divided: 860 intervals."""
+"""Number of windows of equal distances into which all drives are divided: 819 intervals."""
 FEWEST = 4
 """Fewest poses for each window of a motion."""
 STEADY = 0.4
@@ -33,7 +33,7 @@ SLIP, OTHER = 0.2, 0.1
 """Prior probability that a wheel slips in a kind of motion, and that there is a change since some time,
 a different interval, and a different recording each. Assumed: one robot of five slips somewhere. Half of
 it makes errors of more than four deviations possible without a note, twice as much enlarges the
-deviations of robots that do not slip by a further 15 %."""
+deviations of robots that do not slip by a further tenth, by calibration_cases.py."""
 DIFFERENCE, CHANGE = 0.02, 0.005
 """Prior standard deviation of a difference, and of a change since some time [-]. Assumed: wheels slip by
 percents; load, pressure and temperature change a radius by less."""

@@ -177,8 +177,8 @@ class LinearModel:
         of_motion = np.sum(motion * _times(self.Q_inverse, motion)) / variances[0]
         # The unknowns take from each what log det of the normal matrix changes with its weight.
         change = 1e-3
-        lighter = variances * np.exp(-change * np.eye(3))
-        taken = [(self.solved(one).log_det - solution.log_det) / change for one in lighter]
+        heavier = variances * np.exp(-change * np.eye(3))
+        taken = [(self.solved(one).log_det - solution.log_det) / change for one in heavier]
         total = np.array([steps, counts[:, :2].sum(), counts[:, 2].sum()])
         return (
             np.array([of_motion, squares[:, :2].sum(), squares[:, 2].sum()]),

@@ -50,7 +50,7 @@ class Given:
     yaw_offset: float | None = None
     """Heading of the sensor in the body frame (rad)."""
     time_offset: float | None = None
-    """What must be added to the times of the poses (s)."""
+    """What must be added to the times of the poses (s). The clocks do not drift then."""
     wheel_noise: float | None = None
     """Variance of the distance travelled by a wheel, per distance, within `GIVEN_NOISE` (m)."""
     position_noise: float | None = None

@@ -22,7 +22,7 @@ LATERAL = 1e-4
 the covariance of a short increment would be singular."""
 
 REST = 1e-6
-"""Distance that the wheels travel in each step for the covariance, even at rest (m)."""
+"""Variance of each step in x and y for the wheel travel variance 1 m, even at rest (m)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -11,6 +11,7 @@ from diffdrive_jacobian.calibration.initial_estimate import unit
 from diffdrive_jacobian.calibration.model import CalibrationError, Given
 from diffdrive_jacobian.calibration.motion import composed
 from diffdrive_jacobian.calibration.result import Calibration
+from diffdrive_jacobian.numerics.elementary import wrap
 
 BOUNDS = (0.1, 10.0)
 """Multipliers that `wheel_bridge` accepts."""
@@ -91,7 +92,7 @@ def _of_values(result: Calibration, given: Given) -> list[str]:
             f'explains: are the nominal dimensions wrong, or is the reference in {other_unit} instead '
             'of metres?'
         )
-    if given.yaw_offset is None and np.cos(result.estimate.sensor[2]) < -np.cos(BACKWARD):
+    if given.yaw_offset is None and abs(wrap(result.estimate.sensor[2] - np.pi)) < BACKWARD:
         notes.append(
             'the sensor looks backwards. If it is not mounted so, the left and the right wheel are '
             'swapped and both turn in the wrong sense: the multipliers of the radii are exchanged then'
