@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.calibration.determined import UNDETERMINED
 from diffdrive_jacobian.calibration.hypotheses import (
     ARCS,
     DIFFERENCE,
@@ -27,7 +28,6 @@ from diffdrive_jacobian.calibration.hypotheses import (
 from diffdrive_jacobian.calibration.linear_model import linearized
 from diffdrive_jacobian.calibration.model import (
     MULTIPLIERS,
-    UNDETERMINED,
     Array,
     Estimate,
     Segment,

@@ -208,6 +208,7 @@ def hypotheses(cells: Cells) -> list[Hypothesis]:
     for one in cells.windows:
         by_recording.setdefault(one.recording, []).append(one)
     recordings = list(by_recording.values())
+    # Those since some time reach the end, and are changes. Other intervals may be anything.
     whole = [_joined(own, whole=True) for own in recordings if len(recordings) > 1]
     since = [_joined(own[first:]) for own in recordings for first in range(1, len(own))]
     intervals = [

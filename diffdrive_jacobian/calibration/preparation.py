@@ -16,43 +16,10 @@ from diffdrive_jacobian.calibration.model import Array, CalibrationDrive, Calibr
 from diffdrive_jacobian.calibration.motion import Geometry
 from diffdrive_jacobian.numerics.elementary import wrap
 
-
-def poses_apart(segment: Segment, steps: float) -> int:
-    """Return after how many poses, at least 1, both wheels have usually turned by some encoder steps."""
-    step = 12.0**0.5 * float(np.max(segment.wheel_errors, initial=0.0))
-    angles = [np.interp(segment.time, segment.wheel_time, one) for one in segment.wheel_angles.T]
-    slower = np.abs(np.diff(angles)).min(axis=0)
-    turned = float(np.median(slower[slower > 0.0])) if slower.any() else 0.0
-    return max(1, math.ceil(steps * step / turned)) if turned > 0.0 else 1
-
-
 STILL = 1e-5
 """Distance that both wheels together travel while the robot counts as at rest (m)."""
 MOST = 25
 """Largest weight of merged poses: the errors of a real reference at rest are not independent."""
-
-
-def merged(segment: Segment, nominal: Geometry, parameters: Array) -> Segment:
-    """Return a segment in which poses without motion of the wheels between them are averaged."""
-    at = segment.at(parameters)
-    steps = np.abs(np.diff(segment.wheel_angles, axis=0)).sum(axis=1) * nominal.wheel_radius
-    travel = np.concatenate([[0.0], np.cumsum(steps)])
-    place = np.floor(np.interp(at, segment.wheel_time, travel) / STILL)
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(place)) + 1])
-    counts = np.diff([*starts, len(at)])
-    headings = segment.poses[np.repeat(starts, counts), 2]
-    poses = segment.poses.copy()
-    poses[:, 2] = wrap(poses[:, 2] - headings)
-    means = np.add.reduceat(poses, starts) / counts[:, None]
-    means[:, 2] += segment.poses[starts, 2]
-    return replace(
-        segment,
-        time=np.add.reduceat(segment.time, starts) / counts,
-        poses=means,
-        samples=np.minimum(counts, MOST).astype(np.float64),
-    )
-
-
 GAP = 0.5
 """A shorter pause between samples is not a gap (s)."""
 BLIND = 0.02
@@ -77,6 +44,36 @@ GLITCH = 3
 """Number of poses after which a pose that is off is no glitch but a jump."""
 MOST_JUMPS = 0.25
 """Share of glitches and jumps beyond which the reference is refused."""
+
+
+def poses_apart(segment: Segment) -> int:
+    """Return after how many poses, at least 1, both wheels have usually turned by `STEPS`."""
+    step = 12.0**0.5 * float(np.max(segment.wheel_errors, initial=0.0))
+    angles = [np.interp(segment.time, segment.wheel_time, one) for one in segment.wheel_angles.T]
+    slower = np.abs(np.diff(angles)).min(axis=0)
+    turned = float(np.median(slower[slower > 0.0])) if slower.any() else 0.0
+    return max(1, math.ceil(STEPS * step / turned)) if turned > 0.0 else 1
+
+
+def merged(segment: Segment, nominal: Geometry, parameters: Array) -> Segment:
+    """Return a segment in which poses without motion of the wheels between them are averaged."""
+    at = segment.at(parameters)
+    steps = np.abs(np.diff(segment.wheel_angles, axis=0)).sum(axis=1) * nominal.wheel_radius
+    travel = np.concatenate([[0.0], np.cumsum(steps)])
+    place = np.floor(np.interp(at, segment.wheel_time, travel) / STILL)
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(place)) + 1])
+    counts = np.diff([*starts, len(at)])
+    headings = segment.poses[np.repeat(starts, counts), 2]
+    poses = segment.poses.copy()
+    poses[:, 2] = wrap(poses[:, 2] - headings)
+    means = np.add.reduceat(poses, starts) / counts[:, None]
+    means[:, 2] += segment.poses[starts, 2]
+    return replace(
+        segment,
+        time=np.add.reduceat(segment.time, starts) / counts,
+        poses=means,
+        samples=np.minimum(counts, MOST).astype(np.float64),
+    )
 
 
 def overlapping(
@@ -142,7 +139,7 @@ def thinned_poses(segments: Sequence[Segment]) -> tuple[list[Segment], str]:
     kept = []
     for one in segments:
         # Short motions keep enough poses.
-        step = max(1, min(max(every, poses_apart(one, STEPS)), len(one.time) // FEWEST))
+        step = max(1, min(max(every, poses_apart(one)), len(one.time) // FEWEST))
         kept.append(one.part(slice(None, None, step)))
     used = sum(len(one.time) for one in kept)
     note = f'{used} of {count} poses of the reference are used, evenly spaced' if every > 1 else ''

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffdrive_jacobian.calibration.determined import undetermined
 from diffdrive_jacobian.calibration.model import (
     CLOCKS,
     MULTIPLIERS,
@@ -13,7 +14,6 @@ from diffdrive_jacobian.calibration.model import (
     CalibrationDrive,
     Estimate,
     Segment,
-    undetermined,
 )
 from diffdrive_jacobian.calibration.motion import Geometry, composed
 from diffdrive_jacobian.numerics.elementary import wrap

@@ -30,10 +30,11 @@ from diffdrive_jacobian.calibration import CalibrationError, Given, Noise, calib
 from diffdrive_jacobian.calibration.block_tridiagonal import solve_block_tridiagonal
 from diffdrive_jacobian.calibration.clock import time_offset
 from diffdrive_jacobian.calibration.description import explain_undetermined
+from diffdrive_jacobian.calibration.determined import undetermined
 from diffdrive_jacobian.calibration.encoders import PERIOD, between_readings, densified
 from diffdrive_jacobian.calibration.fit import fit
 from diffdrive_jacobian.calibration.linear_model import linearized
-from diffdrive_jacobian.calibration.model import Estimate, undetermined
+from diffdrive_jacobian.calibration.model import Estimate
 from diffdrive_jacobian.calibration.motion import composed, increments, inverted, relative
 from diffdrive_jacobian.calibration.preparation import overlapping
 from diffdrive_jacobian.kinematics.se2 import adjoint
