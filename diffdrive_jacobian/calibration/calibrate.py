@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -66,6 +66,22 @@ def calibrate(
         _check(one)
     _check_noise(given)
     recordings = tuple(map(thinned_samples, recordings))
+    try:
+        return _calibrated(recordings, nominal, given)
+    except CalibrationError as error:
+        known = ', '.join(
+            f'{field.name} {value}'
+            for field in fields(given)
+            if (value := getattr(given, field.name)) is not None
+        )
+        if not known:
+            raise
+        raise CalibrationError(f'{error} (given: {known})') from None
+
+
+def _calibrated(
+    recordings: tuple[CalibrationDrive, ...], nominal: Geometry, given: Given
+) -> Calibration:
     notes = [note for one in recordings for note in sampling_notes(one)]
     parameters, unknown_clocks = _clocks(recordings, nominal, given)
     for _ in range(ROUNDS):
@@ -81,12 +97,12 @@ def calibrate(
 
 
 def _check(one: CalibrationDrive) -> None:
-    for what, time, values in (
-        ('the wheels', one.wheel_time, one.wheel_angles),
-        ('the reference', one.pose_time, one.poses),
+    for what, has, time, values in (
+        ('the wheels', 'have', one.wheel_time, one.wheel_angles),
+        ('the reference', 'has', one.pose_time, one.poses),
     ):
         if len(time) < 2:
-            raise CalibrationError(f'{one.name}: too short: {what} have {len(time)} samples')
+            raise CalibrationError(f'{one.name}: too short: {what} {has} less than two samples')
         if not (np.isfinite(time).all() and np.isfinite(values).all()):
             raise CalibrationError(f'{one.name}: {what} must be finite')
         if (np.diff(time) <= 0.0).any():

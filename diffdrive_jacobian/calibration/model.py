@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 class CalibrationError(DiffdriveError):
-    """The recordings do not determine the parameters, or contradict the model; the message says why."""
+    """The recordings contradict the model or each other; the message says why."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -42,7 +42,7 @@ def remarked(result: Calibration, given: Given) -> Calibration:
     """
     notes = [*result.notes, *_of_values(result, given)]
     estimate = result.estimate
-    correlation = _correlation(result)
+    correlation = _correlation(result) if given.position_noise is None else 0.0
     if correlation > CORRELATED:
         notes.append(
             f'the errors of successive poses of the reference are correlated ({correlation:.2f}): the '
@@ -75,12 +75,12 @@ def _of_values(result: Calibration, given: Given) -> list[str]:
         )
     notes = []
     residuals = np.concatenate(result.residuals())[:, 1:3]
-    if np.sqrt(np.mean(residuals**2)) < EXACT:
+    if np.isnan(given.variances).all() and np.sqrt(np.mean(residuals**2)) < EXACT:
         notes.append(
             'the reference follows the wheels without error: it is simulated without slip, or odometry '
             'that was computed from these wheels, which does not show their true dimensions'
         )
-    if noise.wheel > NOTABLE_WHEEL_NOISE:
+    if given.wheel_noise is None and noise.wheel > NOTABLE_WHEEL_NOISE:
         notes.append(
             f'the wheels differ from the reference by {apart} after 1 m: they slip, '
             'or the reference is filtered, or of another body'

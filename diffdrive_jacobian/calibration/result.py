@@ -38,6 +38,7 @@ class Calibration:
     motions: tuple[Segment, ...]
     """Continuous motions, poses at rest merged; `estimate.states` are their poses."""
     notes: tuple[str, ...] = ()
+    """What `calibrate_run` prints as notes, see doc/calibration.md."""
 
     @property
     def geometry(self) -> Geometry:
@@ -59,8 +60,8 @@ class Calibration:
     def clocks(self) -> Array:
         """Offset (s) and drift (s/s) of the clock of each recording, shape (recordings, 2).
 
-        To the times of the poses the offset is added in their middle, and from there on the drift times
-        the time since.
+        A pose with the time t by the clock of the reference has the time `t + offset + drift (t - t_0)`
+        by that of the wheels, where t_0 is in the middle of the poses.
         """
         return self.estimate.parameters[CLOCKS:].reshape(-1, 2)
 
@@ -88,5 +89,9 @@ class Calibration:
 
     @property
     def undetermined(self) -> list[tuple[str, str]]:
-        """Combinations of the multipliers that the drives do not determine, and what determines them."""
+        """Combinations of the multipliers that the drives do not determine; empty: none.
+
+        Of each, its name and what drive determines it, in words. Its standard deviation is above 2 %:
+        the multipliers must not be used then.
+        """
         return undetermined(self.estimate.covariance[MULTIPLIERS, MULTIPLIERS])
