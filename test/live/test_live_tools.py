@@ -77,6 +77,9 @@ def test_drive_to_live_waits_for_the_page_records_and_ends_by_a_signal(world, tm
     watch = world.start('watch_run', str(tmp_path / 'bag'), '--no-browser', '--rate', '5')
     with opened(watch) as page:
         frame = json.loads(page.recv(timeout=20))
+        while 'speed' not in frame['world']:
+            # The page was opened before the first frame of the bag.
+            frame = json.loads(page.recv(timeout=20))
         assert frame['world']['speed'] == 5.0
         assert len(frame['paths']['/']['points']) > 10
     # There is no robot to steer.
