@@ -31,9 +31,9 @@ RARE, LINES = 0.01, 0.1
 drives that show slip: without these, a discrepancy of arcs is magnified to multipliers far off."""
 SLIP, OTHER = 0.2, 0.1
 """Prior probability that a wheel slips in a kind of motion, and that there is a change since some time,
-a different interval, and a different recording each. Assumed: one robot of five slips somewhere. Half of
-it makes errors of more than four deviations possible without a note, twice as much enlarges the
-deviations of robots that do not slip by a further tenth, by calibration_cases.py."""
+a different interval, and a different recording each. Assumed: one robot of five slips somewhere. With
+half of it, a few more errors exceed four deviations without a note; without it, the deviations of robots
+that do not slip would be smaller by a tenth or more."""
 DIFFERENCE, CHANGE = 0.02, 0.005
 """Prior standard deviation of a difference, and of a change since some time [-]. Assumed: wheels slip by
 percents; load, pressure and temperature change a radius by less."""
