@@ -50,6 +50,8 @@ HARMFUL = 4.0
 """Deviations of a multiplier by which slip that goes unnoticed may falsify it without a note."""
 TO_SEE_SLIP = {IN_PLACE: 'drive more arcs', ARCS: 'turn in place, too'}
 """Kinds of motion in which wheels are known to slip, and what shows it."""
+UNEXPECTED = ('the robot turns', 'the inner wheel travels')
+"""What is no slip of a wheel, and a wheel that slips less than the other."""
 NAMES = ('left radius', 'right radius', 'separation')
 
 
@@ -233,8 +235,8 @@ def _unnoticed(
     least = NOTICED * np.sqrt(found.variances)
     errors = np.abs(found.by_rest[:, MULTIPLIERS]) * least[:, None]
     ratios = errors / np.sqrt(np.diag(estimate.covariance)[MULTIPLIERS])
-    of_wheels = [one.part.kind in TO_SEE_SLIP and one.change.words != 'the robot turns' for one in every]
-    ratios = np.where(np.array(of_wheels)[:, None], ratios, 0.0)
+    expected = [one.part.kind in TO_SEE_SLIP and one.change.words not in UNEXPECTED for one in every]
+    ratios = np.where(np.array(expected)[:, None], ratios, 0.0)
     worst, which = divmod(int(np.argmax(ratios)), 3)
     if ratios[worst, which] < HARMFUL:
         return ()
