@@ -1,8 +1,8 @@
 """The nodes of a world as the EventsExecutor sees them, with their services and clients.
 
-The EventsExecutor uses their attributes only, not their types. What stands for them here leaves timers
-and messages to the scheduler, awaits coroutines, which the EventsExecutor of Jazzy cannot, and lets
-requests and responses wait at the gate of a node.
+What stands for them here (`NodeView` and so on) leaves timers and messages to the scheduler, awaits
+coroutines, which the EventsExecutor of Jazzy cannot, and lets requests and responses wait at the gate of
+a node.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._gate import Gate, send_unless_destroyed
 from diffdrive_jacobian.lockstep._link import queue_depth
 from diffdrive_jacobian.lockstep._tasks import Facade, Tasks
+from diffdrive_jacobian.ros.rclpy_internals import ClientView, NodeView, ResponseView, ServiceView
 
 __tracebackhide__ = True
 
@@ -70,13 +71,8 @@ class Responses:
             service.send_response(response, header)
 
 
-class Member:
-    """A node of the world.
-
-    For the EventsExecutor it has no timers, subscriptions and guard conditions.
-    """
-
-    timers = subscriptions = guards = ()
+class Member(NodeView):
+    """A node of the world."""
 
     def __init__(
         self, node: Node, gate: Gate, tasks: Tasks, changed: Callable[[], None], responses: Responses
@@ -90,19 +86,13 @@ class Member:
             changed: Called when the node has created or destroyed an entity.
             responses: Sends its responses.
         """
-        self.node = node
+        super().__init__(node)
         self.gate = gate
         self.responses = responses
         self._tasks = tasks
         # The node itself keeps a weak reference only.
         self.facade = Facade(changed, self.create_task)
-        self.executor: Any = None
-        self.services: list[Any] = []
-        self.clients: list[Any] = []
         self._wrapped: dict[Any, Any] = {}
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.node, name)
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
         """Schedule a function or a coroutine of the node for the current time. Return its future."""
@@ -147,33 +137,26 @@ def _ignore(*_: Any) -> object:
     return _IGNORED
 
 
-class _Service:
+class _Service(ServiceView):
     """A service whose callback may be a coroutine. The response is sent when it ends."""
 
     def __init__(self, service: Service, member: Member) -> None:
-        self._service = service
+        super().__init__(service)
         self._member = member
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._service, name)
 
     @property
     def callback(self) -> Callable[[Any, Any], Any]:
-        """Function that returns the response of a request.
-
-        The EventsExecutor holds a borrowed reference only: an object that is created here would be freed
-        before it is called.
-        """
-        if self._service not in self._member.node.services:
+        """Function that returns the response of a request."""
+        if self.service not in self._member.node.services:
             return _ignore
         if not self._member.gate.free:
             return _Request
-        callback: Callable[[Any, Any], Any] = self._service.callback
+        callback: Callable[[Any, Any], Any] = self.service.callback
         return callback
 
     def send_response(self, response: Any, header: Any) -> None:
         """Send the result of the callback."""
-        member, service = self._member, self._service
+        member, service = self._member, self.service
         if response is _IGNORED:
             return
         if isinstance(response, _Request):
@@ -195,44 +178,38 @@ class _Service:
 
     def _send(self, response: Any, header: Any) -> None:
         member = self._member
-        send = partial(member.responses.send, member.node, self._service, response, header)
+        send = partial(member.responses.send, member.node, self.service, response, header)
         if member.gate.delays_output:
             member.gate.leave(send)
         else:
             send()
 
 
-class _Client:
+class _Client(ClientView):
     """A client. Its responses wait at the gate of its node."""
 
     def __init__(self, client: Client, gate: Gate) -> None:
-        self._client = client
+        super().__init__(client)
         self._gate = gate
         self._latest: _Response | None = None
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._client, name)
-
     def get_pending_request(self, sequence_number: int) -> Any:
         """Return the future of a request."""
-        future = self._client.get_pending_request(sequence_number)
+        future = self.client.get_pending_request(sequence_number)
         if self._gate.free:
             return future
         # Kept, in case that the EventsExecutor holds a borrowed reference only.
-        self._latest = _Response(future, self._client, self._gate)
+        self._latest = _Response(future, self.client, self._gate)
         return self._latest
 
 
-class _Response:
-    """The future of a request, for the EventsExecutor. Its result waits at a gate."""
+class _Response(ResponseView):
+    """The future of a request. Its result waits at a gate."""
 
     def __init__(self, future: Future, client: Client, gate: Gate) -> None:
-        self._future = future
+        super().__init__(future)
         self._client = client
         self._gate = gate
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._future, name)
 
     def set_result(self, result: Any) -> None:
         """Set the result of the future."""
@@ -240,6 +217,6 @@ class _Response:
         self._gate.enter(
             client,
             client.service_name,
-            partial(self._future.set_result, result),
+            partial(self.future.set_result, result),
             queue_depth(client.qos_profile),
         )

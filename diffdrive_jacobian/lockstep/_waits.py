@@ -13,9 +13,6 @@ from collections.abc import Callable, Iterable
 from types import FrameType
 from typing import Any
 
-import rclpy.executors
-import rclpy.timer
-import rclpy.wait_for_message
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.node import Node
@@ -23,7 +20,12 @@ from rclpy.task import Future
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
-from diffdrive_jacobian.ros.rclpy_internals import replaced
+from diffdrive_jacobian.ros.rclpy_internals import (
+    is_of_executor,
+    is_of_rate,
+    is_of_rclpy,
+    wrap_waits,
+)
 
 __tracebackhide__ = True
 HERE = __file__.rpartition('/')[0]
@@ -57,18 +59,8 @@ class Waits:
         """What executes the callback that has sent the requests."""
         self._sent: list[tuple[Callable[[], bool], Client]] = []
         """Whether each has been answered, and the client that has sent it."""
-        self._restore = [
-            replaced(self._call, (Client, 'call')),
-            replaced(self._call_async, (Client, 'call_async')),
-            replaced(self._wait, (threading.Condition, 'wait')),
-            # Created by `wait_for_message`, which finds it in its module.
-            replaced(self._guard_condition, (rclpy.wait_for_message, 'SignalHandlerGuardCondition')),
-        ]
-
-    def close(self) -> None:
-        """Refuse nothing any more."""
-        while self._restore:
-            self._restore.pop()()
+        self.close = wrap_waits(self._call, self._call_async, self._wait, self._guard_condition)
+        """Refuses nothing any more."""
 
     def _in_callback(self, frame: FrameType | None) -> FrameType | None:
         """Return what executes the callback to which a frame belongs. None: it belongs to none."""
@@ -80,7 +72,7 @@ class Waits:
 
     def _stuck(self, what: str, place: FrameType) -> Stuck:
         """Return the error of a wait, which is raised again if the callback catches it."""
-        while place.f_code.co_filename in _OF_RCLPY and place.f_back is not None:
+        while is_of_rclpy(place) and place.f_back is not None:
             place = place.f_back
         code = place.f_code
         self._guard.raised = Stuck(
@@ -146,8 +138,7 @@ class Waits:
                 if not done() and (executing := self._in_callback(place)) is not None:
                     asked[:] = executing, asked[1] + 1 if asked[0] is executing else 1
                     # An executor of the callback's own would wait for the whole timeout.
-                    spins = place.f_code.co_filename == rclpy.executors.__file__
-                    if asked[1] > POLLS or spins:
+                    if asked[1] > POLLS or is_of_executor(place):
                         raise self._stuck(f'{self._where(client)} (future.{name})', place)
                 return answer()
 
@@ -166,7 +157,7 @@ class Waits:
             place = sys._getframe(1)
             while place.f_code.co_filename == threading.__file__ and place.f_back is not None:
                 place = place.f_back
-            if place.f_code.co_filename == rclpy.timer.__file__:
+            if is_of_rate(place):
                 raise waits._stuck('a callback sleeps by a rate', place)
             if wait(self, timeout):
                 return True
@@ -191,7 +182,3 @@ class Waits:
             return present(*args, **kwargs)
 
         return create
-
-
-_OF_RCLPY = {one.__file__ for one in (rclpy, rclpy.executors, rclpy.timer, rclpy.wait_for_message)}
-"""Files of rclpy between a callback and its wait."""

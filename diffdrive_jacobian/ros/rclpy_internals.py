@@ -5,19 +5,25 @@ object of rclpy. Each function names what it relies on. A release of rclpy that 
 `test/ros/test_rclpy_internals.py`, `test/lockstep` or `test/recording/test_recorder.py`. Tried with
 rclpy 7.1.6 (Jazzy).
 
-`lockstep._scheduler` and `lockstep._services` also rely on how the EventsExecutor accesses nodes.
+What the EventsExecutor uses of nodes, services and clients is in `NodeView` and so on.
 """
 
 from __future__ import annotations
 
 import ctypes
 import inspect
+import os
 import sys
+import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import redirect_stderr
 from functools import cache, wraps
+from types import FrameType
 from typing import Any, ClassVar, NamedTuple, Protocol
 
+import rclpy.executors
+import rclpy.timer
 from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock
@@ -31,7 +37,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.service import Service
 from rclpy.subscription import Subscription
-from rclpy.task import Task
+from rclpy.task import Future, Task
 from rclpy.time import Time
 from rclpy.timer import Timer
 
@@ -132,6 +138,24 @@ def _graph_functions() -> tuple[Callable[..., int | None], Callable[..., int]] |
     add_guard_condition.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
     add_guard_condition.restype = ctypes.c_int
     return guard_condition, add_guard_condition
+
+
+def clients_of(node: Node, service: str) -> list[Any]:
+    """Return what the graph tells of the clients of a service in the domain of a node.
+
+    Relies on the name that rmw_fastrtps gives to the topic of the requests. rclpy tells no endpoints of
+    services.
+    """
+    infos: list[Any] = node.get_publishers_info_by_topic(f'rq{service}Request', no_mangle=True)
+    return infos
+
+
+def process_number(info: Any) -> int:
+    """Return the lower half of the number of the process that has an endpoint.
+
+    Relies on the GID of Fast DDS.
+    """
+    return int.from_bytes(bytes(info.endpoint_gid)[4:6], 'little')
 
 
 # --- Inputs that rclpy parses itself
@@ -354,6 +378,56 @@ def wrap_calls(wrap: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Call
     return replaced(wrap, (Client, 'call_async'), (Service, 'send_response'))
 
 
+def wrap_waits(
+    call: Callable[[Callable[..., Any]], Callable[..., Any]],
+    call_async: Callable[[Callable[..., Any]], Callable[..., Any]],
+    wait: Callable[[Callable[..., bool]], Callable[..., bool]],
+    guard_condition: Callable[[Callable[..., Any]], Callable[..., Any]],
+) -> Callable[[], None]:
+    """Replace all by which a callback may wait for what comes later. Return what restores them.
+
+    Relies on responses being waited for by these methods of clients and of their futures, rates and
+    future callbacks by a `threading.Condition`, and messages by the guard condition that
+    `wait_for_message` creates.
+
+    Args:
+        call: Returns what replaces `Client.call`.
+        call_async: The same of `Client.call_async`.
+        wait: The same of `threading.Condition.wait`, in the whole process.
+        guard_condition: The same of the class of the guard condition.
+    """
+    # Few processes need it.
+    from rclpy import wait_for_message
+
+    restores = [
+        replaced(call, (Client, 'call')),
+        replaced(call_async, (Client, 'call_async')),
+        replaced(wait, (threading.Condition, 'wait')),
+        replaced(guard_condition, (wait_for_message, 'SignalHandlerGuardCondition')),
+    ]
+
+    def restore() -> None:
+        while restores:
+            restores.pop()()
+
+    return restore
+
+
+def is_of_rclpy(frame: FrameType) -> bool:
+    """Return whether a frame is of rclpy, as between a callback and its wait."""
+    return frame.f_code.co_filename.startswith(os.path.dirname(rclpy.__file__) + os.sep)
+
+
+def is_of_executor(frame: FrameType) -> bool:
+    """Return whether a frame is of an executor, which a callback spins by itself."""
+    return bool(frame.f_code.co_filename == rclpy.executors.__file__)
+
+
+def is_of_rate(frame: FrameType) -> bool:
+    """Return whether a frame is of a rate, in whose module nothing else waits for a condition."""
+    return bool(frame.f_code.co_filename == rclpy.timer.__file__)
+
+
 def wrap_publish(wrap: Callable[[Callable[..., None]], Callable[..., None]]) -> Callable[[], None]:
     """Replace `publish` of all publishers. Return what restores it.
 
@@ -516,6 +590,101 @@ def request_message_info(callback: Callable[..., None]) -> None:
 
 
 # --- Executors
+
+
+class NodeView:
+    """A node as the EventsExecutor sees it: without timers, subscriptions and guard conditions.
+
+    Relies on the EventsExecutor using these attributes of nodes only, by their names, and not their
+    type. So does what follows.
+    """
+
+    timers = subscriptions = guards = ()
+
+    def __init__(self, node: Node) -> None:
+        """Show a node without its services and clients."""
+        self.node = node
+        self.executor: Any = None
+        self.services: list[ServiceView] = []
+        self.clients: list[ClientView] = []
+
+    @property
+    def waitables(self) -> Any:
+        """The waitables of the node."""
+        return self.node.waitables
+
+    def get_logger(self) -> Any:
+        """Return the logger of the node."""
+        return self.node.get_logger()
+
+
+class ServiceView(ABC):
+    """A service as the EventsExecutor sees it."""
+
+    def __init__(self, service: Service) -> None:
+        """Show a service."""
+        self.service = service
+
+    @property
+    def handle(self) -> Any:
+        """The service of rcl."""
+        return self.service.handle
+
+    @property
+    def srv_type(self) -> Any:
+        """Type of the service."""
+        return self.service.srv_type
+
+    @property
+    @abstractmethod
+    def callback(self) -> Callable[[Any, Any], Any]:
+        """Function that returns the response of a request.
+
+        The EventsExecutor holds a borrowed reference only: an object that is created here would be freed
+        before it is called.
+        """
+
+    @abstractmethod
+    def send_response(self, response: Any, header: Any) -> None:
+        """Send the result of the callback."""
+
+
+class ClientView(ABC):
+    """A client as the EventsExecutor sees it."""
+
+    def __init__(self, client: Client) -> None:
+        """Show a client."""
+        self.client = client
+
+    @property
+    def handle(self) -> Any:
+        """The client of rcl."""
+        return self.client.handle
+
+    @property
+    def srv_type(self) -> Any:
+        """Type of the service."""
+        return self.client.srv_type
+
+    @abstractmethod
+    def get_pending_request(self, sequence_number: int) -> Any:
+        """Return the future of a request, or a `ResponseView`."""
+
+
+class ResponseView(ABC):
+    """The future of a request as the EventsExecutor sees it."""
+
+    def __init__(self, future: Future) -> None:
+        """Show a future."""
+        self.future = future
+
+    def _set_executor(self, executor: Any) -> None:
+        """Let an executor call what waits for the response."""
+        self.future._set_executor(executor)
+
+    @abstractmethod
+    def set_result(self, result: Any) -> None:
+        """Set the response."""
 
 
 def events_executor(context: Context) -> Executor | None:
