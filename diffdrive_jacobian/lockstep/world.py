@@ -1,8 +1,8 @@
 """Lockstep: simulated time that advances only when every node has processed its inputs.
 
-One step publishes /clock and executes the callbacks of all messages, service calls and timers that are
-due, and of all that they cause. Then time advances to the next timer. Nothing waits for the wall clock,
-so a run is as fast as the machine. Its results are the same each time, bit for bit.
+One step sets the clocks of the nodes and executes the callbacks of all messages, service calls and
+timers that are due, and of all that they cause. Then time advances to the next timer. Nothing waits for
+the wall clock, so a run is as fast as the machine. Its results are the same each time, bit for bit.
 
 A world consists of its nodes (`_nodes`), the links between them (`_links`), and a scheduler, which
 executes one callback after the other (`_scheduler`) while time advances (`_simulated_time`). There may
@@ -33,9 +33,10 @@ from diffdrive_jacobian.lockstep._report import describe
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, checked_nanoseconds
 from diffdrive_jacobian.lockstep._waits import Waits
-from diffdrive_jacobian.lockstep.external.node_process import Command, NodeProcess
+from diffdrive_jacobian.lockstep.external.command import Command
+from diffdrive_jacobian.lockstep.external.linux import check_platform
+from diffdrive_jacobian.lockstep.external.node_process import NodeProcess
 from diffdrive_jacobian.lockstep.external.process import end_all
-from diffdrive_jacobian.lockstep.external.quiet import check_platform
 from diffdrive_jacobian.ros.fastdds_profiles import open_to_others, withdraw
 from diffdrive_jacobian.ros.rclpy_internals import refuse_init
 from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
@@ -192,7 +193,7 @@ class Lockstep:
 
     def _check_lost(self) -> None:
         for process in self._processes:
-            process.check_lost(now=True)
+            process.check_lost()
 
     def _check_open(self) -> None:
         if Lockstep._open is not self:
@@ -258,7 +259,9 @@ class Lockstep:
         return nodes[full]
 
     def remove(self, node: Node) -> None:
-        """Remove and destroy a node without stopping it, as if its process was killed.
+        """Remove and destroy a node without stopping it, as if its process was killed when it is idle.
+
+        What was sent to it is processed before. The fault `Kill` does not wait for that.
 
         Raises:
             LockstepError: The node was not added.
@@ -314,6 +317,11 @@ class Lockstep:
         It always advances. The clock of the nodes, `now`, may jump or stand still.
         """
         return self._scheduler.agenda.now
+
+    @property
+    def world_seconds(self) -> float:
+        """The same in seconds (s), as faults and properties count it."""
+        return self.world_time / NANOSECONDS
 
     def settle(self) -> None:
         """Execute all callbacks that are due at the current time."""

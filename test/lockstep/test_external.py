@@ -29,6 +29,7 @@ from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.exploration.trial import MessageDigest
 from diffdrive_jacobian.faults import ClockPause, Corrupt, Delay, Hang, Kill, Loss, Slow, TimeJump
 from diffdrive_jacobian.lockstep.external import node_process
+from diffdrive_jacobian.lockstep.external.discovery import Discovery
 from diffdrive_jacobian.lockstep.external.launch import shared_memory_of
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -545,15 +546,16 @@ def test_a_program_that_waits_is_woken_up_to_be_interrupted(lockstep):
 
 def test_a_process_whose_endpoints_are_not_matched_is_started_again(lockstep, monkeypatch):
     """One that ends without an error leaves the world."""
-    matched = node_process.NodeProcess._is_matched
+    matched = Discovery.is_matched
     started = []
 
-    def match_at_the_second_start(process):
-        if process.pid not in started:
-            started.append(process.pid)
-        return len(started) > 1 and matched(process)
+    def match_at_the_second_start(discovery):
+        pid = discovery.domain.child.pid
+        if pid not in started:
+            started.append(pid)
+        return len(started) > 1 and matched(discovery)
 
-    monkeypatch.setattr(node_process.NodeProcess, '_is_matched', match_at_the_second_start)
+    monkeypatch.setattr(Discovery, 'is_matched', match_at_the_second_start)
     monkeypatch.setattr(node_process, 'MATCHING', 0.1)
     process = lockstep.start(command('mortal'))
     assert process.pid == started[1]

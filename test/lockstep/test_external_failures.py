@@ -18,11 +18,12 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.lockstep.external import datagrams, node_process
+from diffdrive_jacobian.lockstep.external import domain as domain_module
+from diffdrive_jacobian.lockstep.external import idle, linux
 from diffdrive_jacobian.lockstep.external import process as external_process
-from diffdrive_jacobian.lockstep.external import quiet as quietness
 from diffdrive_jacobian.lockstep.external.launch import shared_memory_of
 from diffdrive_jacobian.lockstep.external.process import ExternalProcess
+from diffdrive_jacobian.lockstep.external.threads import Threads
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
 pytestmark = pytest.mark.process
@@ -109,6 +110,18 @@ def test_a_process_that_is_never_quiet_or_stopped_is_named_with_its_thread(locks
         send(lockstep, 'echo', 0.0)
 
 
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize('waits', [0.0, 0.3])
+def test_a_process_that_a_signal_of_the_test_ends_leaves_the_world(lockstep, number, waits):
+    """At once or when its end is noticed, also if nothing is delivered to it meanwhile."""
+    process = lockstep.start(command('echo'))
+    process.signal(number)
+    time.sleep(waits)
+    lockstep.run_for(0.5)
+    assert process.nodes == []
+    assert process.returncode is not None
+
+
 @pytest.mark.parametrize(
     ('number', 'words'),
     [
@@ -136,8 +149,8 @@ def test_what_a_process_sends_by_itself_is_an_error(lockstep, name):
 
 @pytest.mark.parametrize('name', ['best_effort', 'repeater'])
 def test_messages_that_do_not_fit_into_the_queue_of_a_socket_are_an_error(monkeypatch, name):
-    monkeypatch.setattr(datagrams, 'QUEUE', 50_000)
-    monkeypatch.setattr(datagrams, 'SO_RCVBUFFORCE', socket.SO_RCVBUF)
+    monkeypatch.setattr(linux, 'QUEUE', 50_000)
+    monkeypatch.setattr(linux, 'SO_RCVBUFFORCE', socket.SO_RCVBUF)
     with Lockstep() as world:
         world.start(command(name))
         with fails(rf'messages to or from /{name} were lost .*rmem_max='):
@@ -287,7 +300,7 @@ def test_a_process_that_cannot_take_part_is_refused(lockstep, arguments, options
 
 def test_several_nodes_in_cpp_are_warned_of(lockstep, monkeypatch, recwarn):
     # As if it were in C++: a library that the process has.
-    monkeypatch.setattr(quietness, 'RCLCPP', '_rclpy_pybind11')
+    monkeypatch.setattr(idle, 'RCLCPP', '_rclpy_pybind11')
     lockstep.start(command('echo'))
     # It spins once at a time.
     (timed,) = recwarn.list
@@ -300,13 +313,13 @@ def test_several_nodes_in_cpp_are_warned_of(lockstep, monkeypatch, recwarn):
 
 
 def test_random_addresses_are_refused(lockstep, monkeypatch):
-    monkeypatch.setattr(external_process, 'ADDR_NO_RANDOMIZE', 1)
+    monkeypatch.setattr(linux, 'ADDR_NO_RANDOMIZE', 1)
     with fails('seccomp=unconfined'):
         lockstep.start(command('echo'))
 
 
 def test_another_system_is_refused(lockstep, monkeypatch):
-    monkeypatch.setattr(quietness.platform, 'machine', lambda: 'riscv64')
+    monkeypatch.setattr(linux.platform, 'machine', lambda: 'riscv64')
     with fails('need Linux on x86_64 or aarch64'):
         lockstep.start(['true'])
 
@@ -324,8 +337,8 @@ def test_several_processes_with_nodes_are_refused(lockstep):
 
 
 def test_a_process_that_the_world_has_not_started_is_refused(lockstep, monkeypatch):
-    domain = external_process.free_domain()
-    monkeypatch.setattr(node_process, 'free_domain', lambda: domain)
+    domain = domain_module.free_domain()
+    monkeypatch.setattr(domain_module, 'free_domain', lambda: domain)
     foreign = ExternalProcess(command('echo'), {'ROS_DOMAIN_ID': str(domain)})
     try:
         with fails(r'node /echo is in domain \d+, but in no process that'):
@@ -353,6 +366,8 @@ def test_start_takes_a_program_and_its_arguments(lockstep):
     ]:
         with fails(rf'{name} must be .*, got '):
             lockstep.start(['true'], **{name: wrong})
+    with fails('env must not differ from .*: messages would be lost, got .*ASYNCHRONOUS'):
+        lockstep.start(['true'], env={'RMW_FASTRTPS_PUBLICATION_MODE': 'ASYNCHRONOUS'})
     with fails(r'has no topic /out, /silent \(without=\)'):
         lockstep.start(command('echo'), without=['/silent', '/out', '/echo/out'])
     for cwd in ('/no/such/folder', __file__):
@@ -409,7 +424,7 @@ def test_the_end_of_a_process_is_described(started, text, words):
 def test_a_process_in_a_session_of_its_own_is_ended_with_the_world(started):
     """As the daemon of ros2, and what that has started."""
     launcher = started('setsid sh -c "echo hi; sleep 60" & sleep 60', until='hi')
-    left = set(quietness.Quiet(launcher.root, ()).processes())
+    left = set(Threads(launcher.root, ()).processes())
     assert len(left) >= 4
     launcher.kill()
     assert not any(Path(f'/proc/{pid}').exists() for pid in left)
@@ -418,9 +433,9 @@ def test_a_process_in_a_session_of_its_own_is_ended_with_the_world(started):
 WORLD = """
 import sys, time
 from diffdrive_jacobian.lockstep.external.process import ExternalProcess
-from diffdrive_jacobian.lockstep.external.quiet import Quiet
+from diffdrive_jacobian.lockstep.external.threads import Threads
 process = ExternalProcess(['sh', '-c', 'echo hi; sleep 60 & sleep 60'])
-while not process.printed(0) or len(found := Quiet(process.root, ()).processes()) < 3:
+while not process.printed(0) or len(found := Threads(process.root, ()).processes()) < 3:
     time.sleep(0.001)
 print(*found, flush=True)
 time.sleep(60.0)
@@ -453,18 +468,18 @@ def test_a_process_receives_sigint_that_the_tests_ignore(started):
 
 
 def test_a_domain_with_a_port_in_use_is_not_chosen(monkeypatch):
-    domains = external_process.DOMAINS
-    assert len({external_process.free_domain() for _ in range(10)}) > 1
+    domains = domain_module.DOMAINS
+    assert len({domain_module.free_domain() for _ in range(10)}) > 1
     monkeypatch.delenv('PYTEST_XDIST_WORKER', raising=False)
     monkeypatch.delenv('PYTEST_XDIST_WORKER_COUNT', raising=False)
     # The last one without ports that Linux gives to clients. No other test uses it.
     domain = domains[0] - 1
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         # Of the fourth participant: the first may have ended before.
-        taken.bind(('', external_process._ports(domain)[4]))
-        monkeypatch.setattr(external_process, 'DOMAINS', [domain, *domains])
-        assert domain not in {external_process.free_domain() for _ in range(2 * len(domains))}
-        monkeypatch.setattr(external_process, 'DOMAINS', [domain])
+        taken.bind(('', domain_module._ports(domain)[4]))
+        monkeypatch.setattr(domain_module, 'DOMAINS', [domain, *domains])
+        assert domain not in {domain_module.free_domain() for _ in range(2 * len(domains))}
+        monkeypatch.setattr(domain_module, 'DOMAINS', [domain])
         with fails(f'from {domain} to {domain} are all in use'):
-            external_process.free_domain()
-    assert external_process.free_domain() == domain
+            domain_module.free_domain()
+    assert domain_module.free_domain() == domain

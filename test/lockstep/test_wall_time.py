@@ -14,7 +14,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.exploration.trial import MessageDigest
-from diffdrive_jacobian.lockstep.external import quiet, wall_time
+from diffdrive_jacobian.lockstep.external import idle, wall_time
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
 pytestmark = pytest.mark.process
@@ -125,7 +125,7 @@ def test_a_callback_that_never_returns_is_named(how):
 
 def test_a_thread_in_cpp_that_waits_on_wall_time_is_warned_of(monkeypatch):
     """As if it were in C++: a library that the process has."""
-    monkeypatch.setattr(quiet, 'RCLCPP', '_rclpy_pybind11')
+    monkeypatch.setattr(idle, 'RCLCPP', '_rclpy_pybind11')
     with Lockstep() as world:
         world.start([sys.executable, str(NODES), 'later'])
         world.publish('poke', String())
@@ -151,6 +151,7 @@ def test_slots_of_threads_that_were_killed_are_free_again(monkeypatch):
     slots['thread'][:4] = [2**22 + 1, 2**22 + 2, os.getpid(), 2**22 + 3]
     there.next()
     assert there.next() == (7, 2)
+    del slots
     there.close()
 
 

@@ -25,8 +25,6 @@ DESCRIPTIONS = 'type_description_interfaces/'
 """Package of the type of a service that every node has, and that only tools call."""
 APART = 'lockstep'
 """Namespace, below the name of a node, of the topics that only this node of its process has."""
-PID = slice(4, 6)
-"""Bytes of a GID of Fast DDS with the lower half of the number of its process."""
 
 
 class Quality(NamedTuple):

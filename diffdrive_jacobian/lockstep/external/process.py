@@ -1,31 +1,25 @@
-"""Processes that a test starts, and the ROS domains in which they run."""
+"""Processes that a test starts."""
 
 from __future__ import annotations
 
-import itertools
 import os
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
-import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep.external.launch import remove_abandoned, shared_memory_of
+from diffdrive_jacobian.lockstep.external.linux import first_child, has_random_addresses
 from diffdrive_jacobian.ros.fastdds_profiles import VARIABLE
 from diffdrive_jacobian.ros.runner import DISCOVERY
 from diffdrive_jacobian.text import printable
 
-DOMAINS = range(102, 232)
-"""Domains to choose from. Others do not use them: Linux gives ports of most of them to clients, too."""
-PARTICIPANTS = 32
-"""Number of participants of a domain whose ports are looked at. Each process has one or more."""
 SHOWN_LINES = 15
 """Number of lines that an error quotes of what a process printed."""
 TITLE = 160
@@ -38,51 +32,7 @@ NAP = 0.005
 """Period at which the end of a process is checked (s)."""
 LAUNCHER = [sys.executable, '-IS', str(Path(__file__).with_name('launch.py'))]
 """Command that runs another one, and ends all that it has started."""
-ADDR_NO_RANDOMIZE = 0x0040000
-RANDOMIZE = Path('/proc/sys/kernel/randomize_va_space')
 FATAL = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGKILL)
-_numbers = itertools.count()
-
-
-def free_domain() -> int:
-    """Return a ROS domain that no process on this machine uses.
-
-    Workers of pytest-xdist choose from different domains.
-
-    Raises:
-        LockstepError: There is none.
-    """
-    worker = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
-    workers = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))
-    domains = DOMAINS[worker % len(DOMAINS) :: workers]
-    # Other programs on this machine begin elsewhere.
-    first = zlib.crc32(str(os.getpid()).encode()) + next(_numbers)
-    for number in range(len(domains)):
-        domain = domains[(first + number) % len(domains)]
-        if all(map(_is_free, _ports(domain))):
-            return domain
-    raise LockstepError(
-        f'{len(domains)} ROS domains from {domains[0]} to {domains[-1]} are all in use on this machine'
-    )
-
-
-def _ports(domain: int) -> list[int]:
-    """Return the UDP ports for discovery: multicast, and unicast of each participant.
-
-    All of them: with discovery on the own machine only, no process may use the first, and the process
-    of the first participant may have ended before the others.
-    """
-    multicast = 7400 + 250 * domain
-    return [multicast, *(multicast + 10 + 2 * participant for participant in range(PARTICIPANTS))]
-
-
-def _is_free(port: int) -> bool:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(('', port))
-        except OSError:
-            return False
-    return True
 
 
 class ExternalProcess:
@@ -112,6 +62,8 @@ class ExternalProcess:
         """The command line as errors name it."""
         self.ended_by_test = False
         """Whether the test has ended it."""
+        self._signals: set[int] = set()
+        """What the test has sent."""
         self.wake: Callable[[], object] = lambda: None
         """Called while it is waited for: Python notices a signal only when its node is woken up."""
         self._files = [tempfile.TemporaryFile() for _ in range(2)]  # noqa: SIM115
@@ -140,12 +92,20 @@ class ExternalProcess:
         """Id of the process from which all others descend."""
         self.pid = self.root
         """Process id of the command."""
-        children = Path(f'/proc/{self.root}/task/{self.root}/children')
         while self.pid == self.root and self.returncode is None:
-            with suppress(OSError):
-                for child in children.read_text().split()[:1]:
-                    self.pid = int(child)
+            self.pid = first_child(self.root) or self.root
             time.sleep(NAP)
+
+    @property
+    def has_ended_well(self) -> bool:
+        """Whether it has ended with exit code 0, or by a signal of the test."""
+        code = self.returncode
+        if code is None:
+            return False
+        by_signal = -code in self._signals or any(
+            number in self._signals for number in _signals_in(code)
+        )
+        return code == 0 or self.ended_by_test or by_signal
 
     def check_running(self, node: str = '') -> None:
         """Raise LockstepError if it has ended by itself. `node` says what depends on it."""
@@ -158,12 +118,7 @@ class ExternalProcess:
 
     def check_addresses(self) -> None:
         """Raise LockstepError if the addresses of the process are random."""
-        try:
-            personality = int(Path(f'/proc/{self.root}/personality').read_text(), 16)
-        except OSError:
-            # It has ended, or may not be observed, which is noticed elsewhere.
-            return
-        if not personality & ADDR_NO_RANDOMIZE and RANDOMIZE.read_text().strip() != '0':
+        if has_random_addresses(self.root):
             raise LockstepError(
                 'addresses of processes are random here, and executors call what is ready in the order '
                 'of addresses: a container needs --security-opt seccomp=unconfined'
@@ -187,6 +142,7 @@ class ExternalProcess:
         """Send a signal to it and its children. Nothing happens if it has ended."""
         if not isinstance(number, int) or number not in signal.valid_signals():
             raise LockstepError(f'signal takes its number, got {printable(repr(number), 200)}')
+        self._signals.add(number)
         if number == signal.SIGKILL:
             self.kill()
         elif self.returncode is None:
@@ -274,5 +230,10 @@ def _signal_of_child(code: int) -> str:
 
     A shell exits with 128 + signal, and `ros2 run` with 256 - signal.
     """
-    found = [number for number in (code - 128, 256 - code) if number in FATAL]
+    found = [number for number in _signals_in(code) if number in FATAL]
     return _signal_name(found[0]) if found else ''
+
+
+def _signals_in(code: int) -> tuple[int, int]:
+    """Return which signals an exit code may stand for."""
+    return code - 128, 256 - code

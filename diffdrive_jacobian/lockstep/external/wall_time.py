@@ -159,6 +159,9 @@ class WallTime:
     def close(self) -> None:
         """Forget it. The processes have ended."""
         os.close(self._file)
+        # What looks into the memory would keep it open.
+        del self._slots, self._page
+        self._memory.close()
 
 
 def built() -> Path:
