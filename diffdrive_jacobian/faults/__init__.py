@@ -2,20 +2,16 @@
 
 With `from diffdrive_jacobian import faults`, a test calls
 `lockstep.inject(faults.Loss('odom', probability=0.5, start=2.0, duration=1.0))`.
+
+Those of the robot are imported on first use: they need its nodes.
 """
 
+from typing import TYPE_CHECKING
+
+from diffdrive_jacobian import lazy
+from diffdrive_jacobian.faults.corrupt import Corrupt
 from diffdrive_jacobian.faults.fault import Fault, Filter, TopicFault
-from diffdrive_jacobian.faults.robot import (
-    ActuatorLag,
-    DeadWheel,
-    EncoderSteps,
-    Push,
-    RobotFault,
-    SaturatedWheel,
-    Slip,
-    WrongGeometry,
-)
-from diffdrive_jacobian.faults.topics import Corrupt, Delay, Duplicate, Loss, RateLimit, Reorder, Stale
+from diffdrive_jacobian.faults.topics import Delay, Duplicate, Loss, RateLimit, Reorder, Stale
 from diffdrive_jacobian.faults.world import (
     ClockPause,
     Hang,
@@ -29,6 +25,18 @@ from diffdrive_jacobian.faults.world import (
 )
 from diffdrive_jacobian.lockstep._fault_log import FaultEvent
 from diffdrive_jacobian.lockstep._injection import Injection
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.robot_testing.faults import (
+        ActuatorLag,
+        DeadWheel,
+        EncoderSteps,
+        Push,
+        RobotFault,
+        SaturatedWheel,
+        Slip,
+        WrongGeometry,
+    )
 
 __all__ = [
     'ActuatorLag',
@@ -61,3 +69,15 @@ __all__ = [
     'TopicFault',
     'WrongGeometry',
 ]
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy.attach(
+        __name__,
+        dict.fromkeys(
+            (
+                *('ActuatorLag', 'DeadWheel', 'EncoderSteps', 'Push'),
+                *('RobotFault', 'SaturatedWheel', 'Slip', 'WrongGeometry'),
+            ),
+            'robot_testing.faults',
+        ),
+    )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import random
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Annotated, Any, ClassVar
 
@@ -18,6 +18,7 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.validate_topic_name import validate_topic_name
 
+from diffdrive_jacobian.lockstep._injection import Filter as Filter
 from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.lockstep._injection import Undo as Undo
 from diffdrive_jacobian.numerics.checks import Checked, NotNegative, PositiveOrInfinite, nonempty
@@ -39,11 +40,10 @@ def _ros_name(name: str, value: Any) -> str:
 RosName = Annotated[str, _ros_name]
 
 
-@dataclass(frozen=True, repr=False)
 class Expression(Checked):
     """Base class of checked dataclasses that are printed as the expression that makes them.
 
-    Subclasses are decorated with `@dataclass(frozen=True, repr=False)`.
+    Subclasses are dataclasses with `repr=False`.
     """
 
     def __post_init__(self) -> None:
@@ -63,7 +63,8 @@ class Expression(Checked):
 
     def _expression(self, literal: Callable[[Any], str]) -> str:
         shown = []
-        for one in sorted(fields(self), key=lambda one: bool(one.kw_only)):
+        own: Any = self
+        for one in sorted(fields(own), key=lambda one: bool(one.kw_only)):
             value = getattr(self, one.name)
             if one.default is MISSING and not one.kw_only:
                 shown.append(literal(value))
@@ -88,16 +89,6 @@ def brief(value: Any) -> str:
         first = literal(value[:SHOWN])
         return f'{first[:-1]}, ... {len(value)} in all{first[-1]}'
     return literal(value)
-
-
-Filter = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
-"""What a topic fault does with a message.
-
-Receives the world time (ns since the start of the `Lockstep`) and the serialized message, while the
-fault lasts. Returns the messages that arrive instead, each with its delay (ns): `[]` loses it,
-`[(0, data)]` leaves it as it is. An attribute `observe(now, data)`, if there is one, is called with each
-message before the fault begins and after it has ended.
-"""
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -173,11 +164,6 @@ class TopicFault(Fault):
 
     keeps_order: ClassVar[bool] = False
     """Whether a message never overtakes an earlier one, also not after the fault has ended."""
-    at_publisher: ClassVar[bool] = False
-    """Whether messages are changed when they are published, for all subscriptions and recorders alike.
-
-    `node` is then the name of the publishing node.
-    """
 
     @abstractmethod
     def begin(self, rng: random.Random, message_type: type) -> Filter:
@@ -185,10 +171,4 @@ class TopicFault(Fault):
 
     def install(self, injection: Injection) -> None:
         """Filter the messages of the topic."""
-        injection.filter_topic(
-            self.topic,
-            self.node,
-            self.begin,
-            keeps_order=self.keeps_order,
-            at_publisher=self.at_publisher,
-        )
+        injection.filter_topic(self.topic, self.node, self.begin, keeps_order=self.keeps_order)

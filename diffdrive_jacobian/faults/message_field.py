@@ -1,4 +1,4 @@
-"""A field of a message by its path, which a fault changes."""
+"""A field of a message by its path, which a fault changes and a property looks at."""
 
 from __future__ import annotations
 
@@ -50,20 +50,38 @@ class MessageField:
         self.type = kind.element if isinstance(kind, (Array, Sequence)) else kind
         """Type of the value, or of the elements."""
 
+    def values(self, message: Any) -> Any:
+        """Return a sequence of the value in a message, or of the elements of an array; empty: none."""
+        holder = self._holder(message)
+        if holder is None:
+            return []
+        name, index = self._steps[-1]
+        value = getattr(holder, name)
+        if index is not None:
+            return value[index : index + 1]
+        return value if self.is_array else [value]
+
+    def _holder(self, message: Any) -> Any:
+        """Return the structure in which the field is; None: the message has no such element."""
+        holder = message
+        for step, index in self._steps[:-1]:
+            holder = getattr(holder, step)
+            if index is not None:
+                if index >= len(holder):
+                    return None
+                holder = holder[index]
+        return holder
+
     def replace(self, message: Any, change: Callable[[Any], Any]) -> bool:
         """Replace the value in a message, or each element of an array, by that which `change` returns.
 
         `change` may change a structure in place. Return whether there is anything else than before.
         There is not if the message has no such element.
         """
-        holder = message
-        *steps, (name, last) = self._steps
-        for step, index in steps:
-            holder = getattr(holder, step)
-            if index is not None:
-                if index >= len(holder):
-                    return False
-                holder = holder[index]
+        holder = self._holder(message)
+        if holder is None:
+            return False
+        name, last = self._steps[-1]
         if last is None and not self.is_array:
             old = getattr(holder, name)
             before = repr(old)

@@ -51,6 +51,7 @@ class Kill(NodeFault):
         world, name = injection.world, injection.gate(self.node).name
         # The faults because of which the node is not there.
         deaths = world.shared[f'deaths of {name}']
+        victims = world.shared[f'victims of the name {name}']
 
         def die() -> Undo:
             deaths.append(self)
@@ -63,13 +64,15 @@ class Kill(NodeFault):
                     f'{self!r} cannot start {name} again: create it with Lockstep.create'
                 )
             world.kill(victim)
+            victims.append(self)
             injection.note(f'{name} is killed')
             return rise
 
         def rise() -> None:
             deaths.remove(self)
-            # One that was created after the fault began was not killed.
-            if not deaths and world.restartable(name) and world.find(name) is None:
+            # One that was created after the fault began was not killed, nor one that was not there.
+            if victims and not deaths and world.restartable(name) and world.find(name) is None:
+                victims.clear()
                 world.restart(name)
                 injection.note(f'{name} is started again')
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any
@@ -12,6 +13,7 @@ from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.names import type_name
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
+from diffdrive_jacobian.text import error_text
 
 
 class LockstepError(DiffdriveError):
@@ -75,6 +77,13 @@ class PropertyViolation(LockstepError):  # noqa: N818
         """Return the message."""
         first = f'{self.property} is violated at {self.seconds:g} s: {self.text}'
         return f'{first}\n{self.report}' if self.report else first
+
+
+def raised(error: Exception) -> str:
+    """Return what a property has raised instead of an answer, and where, as text."""
+    *_, last = traceback.extract_tb(error.__traceback__)
+    name = type(error).__name__
+    return f'it raised {name}: {error_text(error)}, in {last.filename}:{last.lineno} ({last.name})'
 
 
 def described(value: Any) -> str:

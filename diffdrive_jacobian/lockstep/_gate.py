@@ -20,7 +20,7 @@ FREE = object()
 """Result of a callback that has done nothing, and therefore takes no time."""
 
 
-class Waiting(NamedTuple):
+class Held(NamedTuple):
     """A callback that waits at a gate."""
 
     since: int
@@ -56,7 +56,7 @@ class Gate:
         """Functions that return the delay of a tick (ns)."""
         self.suspended: set[Timer] = set()
         """Timers whose tick is delayed."""
-        self.waiting: deque[Waiting] = deque()
+        self.waiting: deque[Held] = deque()
         """Callbacks that wait, the oldest first."""
         self._lost: Counter[str] = Counter()
         self.delayed: set[Timer] = set()
@@ -130,7 +130,7 @@ class Gate:
         if len(same) >= depth:
             self.waiting.remove(same[0])
             self._lost[name] += 1
-        self.waiting.append(Waiting(self._agenda.now, queue, name, work))
+        self.waiting.append(Held(self._agenda.now, queue, name, work))
         self._update()
 
     def run(self, work: Callable[[], Any]) -> Any:

@@ -8,24 +8,33 @@ from __future__ import annotations
 
 import math
 import random
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._fault_log import FaultLog, Hits, totals
+from diffdrive_jacobian.lockstep._fault_log import Hits, totals
 from diffdrive_jacobian.lockstep._gate import Gate
-from diffdrive_jacobian.lockstep._link import Link, Source, Stage
-from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep._link import Link, Stage
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.time_units import in_seconds, nanoseconds
 
+if TYPE_CHECKING:
+    from diffdrive_jacobian.lockstep._faults import Faults
+
 Filter = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
-"""Receives a world time (ns) and a message, returns messages with their delays (ns)."""
+"""What a topic fault does with a message.
+
+Receives the world time (ns since the start of the `Lockstep`) and the serialized message, while the
+fault lasts. Returns the messages that arrive instead, each with its delay (ns): `[]` loses it,
+`[(0, data)]` leaves it as it is. If it has these attributes:
+
+- `observe(now, data)` is called with each message before the fault begins and after it has ended.
+- `missing` is what the fault needs and has not met in any message, as a sentence; None: nothing.
+"""
 Begin = Callable[[random.Random, type], Filter]
 """Returns the filter of one subscription."""
 Undo = Callable[[], None]
@@ -47,62 +56,6 @@ class Fault(Protocol):
         """Schedule what the fault does when it begins and ends."""
 
 
-@dataclass(frozen=True)
-class World:
-    """What faults can do with a world.
-
-    Attributes:
-        scheduler: Executes the nodes.
-        node: Node of the test, which resolves names.
-        log: Keeps the events.
-        observers: Nodes that are affected only by faults that name them.
-        restartable: Returns whether the node of a name can be created again.
-        restart: Creates the node of a name again.
-        shared: Lists that faults share, by name.
-    """
-
-    scheduler: Scheduler
-    node: Node
-    log: FaultLog
-    observers: set[Node]
-    restartable: Callable[[str], bool]
-    restart: Callable[[str], None]
-    shared: defaultdict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
-
-    def find(self, name: str) -> Node | None:
-        """Return the node that has a fully qualified name now; None: there is none."""
-        nodes = self.scheduler.nodes
-        return next((node for node in nodes if node.get_fully_qualified_name() == name), None)
-
-    def kill(self, node: Node) -> None:
-        """Remove and destroy a node at once."""
-        self.scheduler.kill(node)
-
-    def shift_clock(self, duration: int) -> int:
-        """Shift the clock of the nodes (ns). Return the difference that was applied (ns)."""
-        return self.scheduler.clocks.shift(duration)
-
-    def pause_clock(self) -> Undo:
-        """Stop the clock of the nodes. Return what lets it go on."""
-        clocks = self.scheduler.clocks
-        clocks.pauses += 1
-
-        def go_on() -> None:
-            clocks.pauses -= 1
-
-        return go_on
-
-    def delay_responses(self, service: str, late: int | None, note: Callable[[], None]) -> Undo:
-        """Delay the responses of a service. Return what ends that.
-
-        Args:
-            service: Full name of the service.
-            late: The delay (ns). None: they are never sent.
-            note: Called for each response.
-        """
-        return self.scheduler.responses.delay(service, late, note)
-
-
 class _Filtered(NamedTuple):
     """What a fault filters."""
 
@@ -110,17 +63,16 @@ class _Filtered(NamedTuple):
     owner: str
     begin: Begin
     keeps_order: bool
-    at_publisher: bool
 
 
 class Injection:
     """What one fault does to a world. A fault calls its methods in `install`."""
 
-    def __init__(self, world: World, fault: Fault, position: int, same: int, seed: int) -> None:
+    def __init__(self, world: Faults, fault: Fault, position: int, same: int, seed: int) -> None:
         """Start without effect.
 
         Args:
-            world: The world.
+            world: What faults can do to the world.
             fault: The fault.
             position: Number of faults that were injected before.
             same: Number of equal ones among them. Random numbers depend on this, not on `position`, so
@@ -138,13 +90,13 @@ class Injection:
         self.ended = False
         """Whether it has ended."""
         self._generators: Counter[str] = Counter()
-        self.missing: str | None = None
-        """What the fault needs and has not met, as a sentence; None: nothing."""
+        self._missing: str | None = None
         self._is_there: Callable[[Iterable[Node]], bool] = any
         self._begins: list[Callable[[], Undo | None]] = []
         self._ends: list[Undo] = []
         self._meetings: list[Callable[[], None]] = []
         self._filtered: _Filtered | None = None
+        self._filters: list[Filter] = []
         self._hits: list[Hits] = []
         self._last_arrival = 0
         """World time at which the last message arrives that the fault has delayed (ns)."""
@@ -207,6 +159,14 @@ class Injection:
         """Add an event."""
         self.world.log.add(self._position, self.fault, what)
 
+    @property
+    def missing(self) -> str | None:
+        """What the fault needs and has not met, as a sentence; None: nothing."""
+        if self._missing is not None or not self._filters:
+            return self._missing
+        missing: list[str | None] = [getattr(one, 'missing', None) for one in self._filters]
+        return missing[0] if all(missing) else None
+
     def state(self) -> str:
         """Return whether the fault is active, and what it did so far."""
         if self.active:
@@ -233,7 +193,7 @@ class Injection:
             missing: What to report if it never appears.
             is_there: Returns whether it is there, among nodes.
         """
-        self.missing = missing
+        self._missing = missing
         self._is_there = is_there
         self.look()
 
@@ -243,8 +203,8 @@ class Injection:
 
     def look(self) -> None:
         """Check whether there is anything that the fault affects, after nodes have changed."""
-        if self.missing is not None and self._is_there(self.world.scheduler.nodes):
-            self.missing = None
+        if self._missing is not None and self._is_there(self.world.scheduler.nodes):
+            self._missing = None
         for action in self._meetings:
             action()
 
@@ -274,7 +234,6 @@ class Injection:
         begin: Begin,
         *,
         keeps_order: bool = False,
-        at_publisher: bool = False,
     ) -> None:
         """Filter the messages of a topic.
 
@@ -283,7 +242,6 @@ class Injection:
             node: Name of the node whose subscriptions are filtered; empty: all but observers.
             begin: Returns the filter of a subscription.
             keeps_order: Whether a message never overtakes an earlier one.
-            at_publisher: Whether messages are filtered when they are published, once for all.
 
         Raises:
             LockstepError: The topic is /clock.
@@ -294,18 +252,18 @@ class Injection:
                 f'{self.fault!r}: lockstep sets the clocks itself; use TimeJump or ClockPause'
             )
         owner = node and self.full_name(node)
-        self._filtered = _Filtered(name, owner, begin, keeps_order, at_publisher)
-        kind, of = 'publisher' if at_publisher else 'subscription', f' of {owner}' if owner else ''
+        self._filtered = _Filtered(name, owner, begin, keeps_order)
+        of = f' of {owner}' if owner else ''
 
         def is_there(nodes: Iterable[Node]) -> bool:
             return any(
-                endpoint.topic_name == name
+                subscription.topic_name == name
                 for one in nodes
-                for endpoint in (one.publishers if at_publisher else one.subscriptions)
+                for subscription in one.subscriptions
                 if self._concerns(one, owner)
             )
 
-        self.expect(f'no {kind}{of} of {name} was seen', is_there)
+        self.expect(f'no subscription{of} of {name} was seen', is_there)
 
     def _concerns(self, node: Node, owner: str) -> bool:
         """Return whether the fault affects a node."""
@@ -313,22 +271,21 @@ class Injection:
             node.get_fully_qualified_name() == owner or (not owner and node not in self.world.observers)
         )
 
-    def stage_of(self, end: Source | Link) -> Stage | None:
-        """Return the stage of the fault at one end of a link; None: it does not affect it."""
+    def stage_of(self, link: Link) -> Stage | None:
+        """Return the stage of the fault in a link; None: it does not affect it."""
         filtered = self._filtered
-        if filtered is None or filtered.at_publisher != isinstance(end, Source):
+        if filtered is None or link.topic != filtered.topic:
             return None
-        if end.topic != filtered.topic or end.owner is None:
+        if not self._concerns(link.owner, filtered.owner):
             return None
-        if not self._concerns(end.owner, filtered.owner):
-            return None
-        return self._stage(filtered, end.owner, end.message_type)
+        return self._stage(filtered, link.owner, link.message_type)
 
     def _stage(self, filtered: _Filtered, node: Node, message_type: type) -> Stage:
         topic, name = filtered.topic, node.get_fully_qualified_name()
         change = filtered.begin(self.rng(f'{name} {topic}'), message_type)
+        self._filters.append(change)
         observe = getattr(change, 'observe', None)
-        hits = Hits(f'{topic} {"from" if filtered.at_publisher else "to"} {name}', self.note)
+        hits = Hits(f'{topic} to {name}', self.note)
         self._hits.append(hits)
         agenda, earliest = self._agenda, 0
 

@@ -1,9 +1,9 @@
 """The two ends of a link: what a sender publishes on a topic, and what one receiver gets of it.
 
-A message goes from the `Source` of its sender through the stages of that, is sent, and waits in the
-queue of each subscription. The `Link` to a receiver takes it from there, and lets it pass its own
-stages. Then it waits at the gate of the receiver, or is received at once. A stage may lose, delay,
-change or repeat messages. Most links have none.
+A message is sent by the `Source` of its sender, and waits in the queue of each subscription. The `Link`
+to a receiver takes it from there, and lets it pass its stages. Then it waits at the gate of the
+receiver, or is received at once. A stage may lose, delay, change or repeat messages. Most links have
+none.
 
 Neither end needs to be a node of rclpy: it is a topic, a type, and the functions that send, take and
 receive.
@@ -77,9 +77,7 @@ class Source:
         'links',
         'message_type',
         'observers',
-        'owner',
         'send',
-        'stages',
         'topic',
     )
 
@@ -105,9 +103,6 @@ class Source:
         self.message_type = message_type
         self.links = links
         self.observers = observers
-        self.owner: Node | None = None
-        """The node of the publisher. None: it was not added yet."""
-        self.stages: list[Stage] = []
         self.count = 0
         """Number of messages."""
         self.last: tuple[int, int, Any] = 0, 0, None

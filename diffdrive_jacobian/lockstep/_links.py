@@ -25,7 +25,7 @@ from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.lockstep._clock import Agenda, Clocks
 from diffdrive_jacobian.lockstep._gate import Gates, send_unless_destroyed
-from diffdrive_jacobian.lockstep._link import Delivered, Link, Published, Source, Stage, pass_on
+from diffdrive_jacobian.lockstep._link import Delivered, Link, Published, Source, Stage
 from diffdrive_jacobian.lockstep._services import Member
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import (
@@ -38,8 +38,8 @@ from diffdrive_jacobian.ros.rclpy_internals import (
 
 __tracebackhide__ = True
 
-Filter = Callable[[Source | Link], Stage | None]
-"""Returns the stage of a fault at one end of a link; None: the fault does not affect it."""
+StageOf = Callable[[Link], Stage | None]
+"""Returns the stage of a fault in a link; None: the fault does not affect it."""
 
 
 class SentElsewhere(NamedTuple):
@@ -83,10 +83,8 @@ class Links:
         self._admitted: set[Link] = set()
         self.polled: list[Link] = []
         """Links whose topic has publishers that cannot be observed."""
-        self._filters: list[Filter] = []
-        self._members: Iterable[Node] = ()
+        self._stages_of: list[StageOf] = []
         self._numbers = count(1)
-        self._sending = False
         self._restore: Callable[[], None] | None = None
 
     def to(self, topic: str) -> list[Link]:
@@ -101,35 +99,26 @@ class Links:
         """Return the functions that are called before each message of a topic is received."""
         return self._delivered.setdefault(topic, [])
 
-    def filter(self, stage_of: Filter, *, first: bool = False) -> None:
-        """Add the stages of a fault to all links that it affects, now and later.
+    def add_stages(self, stage_of: StageOf, *, first: bool = False) -> None:
+        """Add the stage of a fault to all links that it affects, now and later.
 
         Args:
             stage_of: Returns the stage.
             first: Whether it is the first stage of later links.
         """
-        self._filters.insert(0 if first else len(self._filters), stage_of)
+        self._stages_of.insert(0 if first else len(self._stages_of), stage_of)
         for link in self._links.values():
             if (stage := stage_of(link)) is not None:
                 link.add_stage(stage)
-        for source in self._sources.values():
-            if source.owner is not None and (stage := stage_of(source)) is not None:
-                source.stages.append(stage)
-
-    def _stages_of(self, end: Source | Link) -> list[Stage]:
-        found = [stage_of(end) for stage_of in self._filters]
-        return [stage for stage in found if stage is not None]
 
     # --- Sending
 
-    def start(self, members: Iterable[Node], note_thread: Callable[..., None]) -> None:
+    def start(self, note_thread: Callable[..., None]) -> None:
         """Start to observe what is published.
 
         Args:
-            members: The nodes of the world. It stays up to date.
             note_thread: Called in other threads, as `Scheduler.note_thread`.
         """
-        self._members = members
         links, sources, gates, clocks = self, self._sources, self._gates, self._clocks
         numbers = self._numbers
         extend, thread, get_ident = self.pending.extend, self.thread, threading.get_ident
@@ -144,7 +133,10 @@ class Links:
                     source = sources[self]
                 except KeyError:
                     source = links._source_of(self)
-                if (source.stages or gates.running) and links._divert(self, source, msg):
+                if gates.running is not None and self not in links.unaffected:
+                    # When the time of the callback is over.
+                    data = msg if isinstance(msg, bytes) else serialize_message(msg)
+                    gates.running.leave(partial(send_unless_destroyed, self.publish, data))
                     return
                 if type(msg) is bytes:
                     # Without the two calls of `Publisher.publish`.
@@ -172,40 +164,7 @@ class Links:
         links, observers = self.to(topic), self.observers_of_published(topic)
         source = Source(topic, publisher.msg_type, links, observers, raw_sender(publisher))
         self._sources[publisher] = source
-        self._find_owner(publisher, source)
         return source
-
-    def _find_owner(self, publisher: Publisher, source: Source) -> None:
-        for node in self._members:
-            if publisher in node.publishers:
-                source.owner = node
-                source.stages += self._stages_of(source)
-                return
-
-    def _divert(self, publisher: Publisher, source: Source, message: Any) -> bool:
-        """Let a message pass the gate and the stages of its sender.
-
-        Returns:
-            Whether it does. False: it can be sent now.
-        """
-        if self._sending or publisher in self.unaffected:
-            return False
-        data = message if isinstance(message, bytes) else serialize_message(message)
-        send = partial(send_unless_destroyed, self._send, publisher)
-        go_on = partial(pass_on, source.stages, data, self._agenda, send, send)
-        if self._gates.running is not None:
-            self._gates.running.leave(go_on)
-        else:
-            go_on()
-        return True
-
-    def _send(self, publisher: Publisher, data: bytes) -> None:
-        """Send a message that has passed the gate and the stages."""
-        self._sending = True
-        try:
-            publisher.publish(data)
-        finally:
-            self._sending = False
 
     # --- Receiving
 
@@ -245,9 +204,6 @@ class Links:
             links.clear()
         for link in self._links.values():
             self.to(link.topic).append(link)
-        for publisher, source in self._sources.items():
-            if source.owner is None:
-                self._find_owner(publisher, source)
         return [link for link in self._links.values() if link not in self._admitted]
 
     def _link(self, subscription: Subscription, member: Member) -> Link:
@@ -265,8 +221,9 @@ class Links:
             create_task=member.create_task,
             release=release,
         )
-        for stage in self._stages_of(link):
-            link.add_stage(stage)
+        for stage_of in self._stages_of:
+            if (stage := stage_of(link)) is not None:
+                link.add_stage(stage)
         return link
 
     def drop_destroyed(self, nodes: Iterable[Node]) -> None:

@@ -1,4 +1,4 @@
-"""The nodes of a world: added, found, removed, and created again."""
+"""The nodes of a world: checked and added, and created again."""
 
 from __future__ import annotations
 

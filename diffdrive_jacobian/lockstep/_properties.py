@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 from rclpy.node import Node
 from rclpy.service import Service
 
-from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation, described
+from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation, described, raised
 from diffdrive_jacobian.lockstep._link import Delivered, Published
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
@@ -51,6 +51,16 @@ class _Required(NamedTuple):
         """Stop observing."""
         for observers, observe in self.observing:
             observers.remove(observe)
+
+
+def answer(question: Callable[[], str | None]) -> str | None:
+    """Return what `check` or `finish` of a property returns. That it raises something violates it."""
+    try:
+        return question()
+    except LockstepError:
+        raise
+    except Exception as error:
+        return raised(error)
 
 
 class Properties:
@@ -101,7 +111,7 @@ class Properties:
     def check(self) -> None:
         """Check what is required at the current time, when all callbacks have been executed."""
         for required in self.required:
-            if (text := required.watch.check()) is not None:
+            if (text := answer(required.watch.check)) is not None:
                 self.required.remove(required)
                 required.end()
                 raise self._violation(required.property, text)
@@ -122,7 +132,7 @@ class Properties:
         for one in required:
             one.end()
         for one in required:
-            if (text := one.watch.finish()) is not None:
+            if (text := answer(one.watch.finish)) is not None:
                 raise self._violation(one.property, text)
 
     def _violation(self, violated: Property, text: str) -> PropertyViolation:

@@ -93,7 +93,7 @@ class Scheduler:
         self._restore_topics = replaced(
             one_type_per_topic, (Node, 'create_publisher'), (Node, 'create_subscription')
         )
-        self.links.start(self._members, self.note_thread)
+        self.links.start(self.note_thread)
 
     def _noting(self, send: Callable[..., Any]) -> Callable[..., Any]:
         """Return a method that sends a request or a response, and takes its place among the messages."""

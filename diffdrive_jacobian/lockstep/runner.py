@@ -9,7 +9,6 @@ from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.ros.runner import NodeRunner
-from diffdrive_jacobian.time_units import NANOSECONDS
 
 LONGEST_STEP = 1.0
 """Largest advance of the time in which nothing happens, as in a world without timers (s)."""
@@ -36,7 +35,7 @@ class LockstepRunner(NodeRunner):
 
     def seconds(self) -> float:
         """Return the world time (s), which advances even when the clock of the nodes jumps."""
-        return self._world.world_time / NANOSECONDS
+        return self._world.world_seconds
 
     def settle(self) -> None:
         """Execute the callbacks that are due. No time passes."""

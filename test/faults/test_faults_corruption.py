@@ -18,7 +18,7 @@ from sensor_msgs.msg import BatteryState, Image, JointState, LaserScan
 from std_msgs.msg import Bool, Byte, Empty, Int8, Int64, String, UInt8
 from support.ros_messages import odometry, time_of
 
-from diffdrive_jacobian.faults.topics import Corrupt
+from diffdrive_jacobian.faults.corrupt import Corrupt
 
 SECOND = 1_000_000_000
 

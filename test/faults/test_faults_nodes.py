@@ -54,6 +54,14 @@ def test_a_node_that_was_created_after_the_fault_began_is_not_killed(lockstep):
     assert whats(lockstep) == ['begins', 'the node is not there', 'ends']
 
 
+def test_a_node_that_was_removed_before_is_not_made_again(lockstep, relay):
+    lockstep.remove(relay)
+    lockstep.inject(faults.Kill('relay', start=0.1, duration=0.1))
+    lockstep.run_for(0.5)
+    assert whats(lockstep) == ['begins', 'the node is not there', 'ends']
+    lockstep.close()
+
+
 def test_a_killed_node_is_gone_with_its_latched_messages(lockstep):
     source = lockstep.create(lambda: Source(profile=LATCHED))
     lockstep.create(lambda: Sink(profile=LATCHED))

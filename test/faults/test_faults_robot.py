@@ -15,7 +15,11 @@ from support.lockstep_nodes import Topics, change, make
 from support.ros_messages import instants, pose_of, twist, twist_stamped, twists
 
 from diffdrive_jacobian.control import VelocityLimits
-from diffdrive_jacobian.faults.robot import (
+from diffdrive_jacobian.faults.world import Kill
+from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+from diffdrive_jacobian.kinematics.se2 import compose, integrate, inverse, wrap_angle
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.robot_testing.faults import (
     ActuatorLag,
     DeadWheel,
     EncoderSteps,
@@ -24,10 +28,6 @@ from diffdrive_jacobian.faults.robot import (
     Slip,
     WrongGeometry,
 )
-from diffdrive_jacobian.faults.world import Kill
-from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
-from diffdrive_jacobian.kinematics.se2 import compose, integrate, inverse, wrap_angle
-from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.actuators import SETTLING, Actuators
 from diffdrive_jacobian.simulation.encoders import Encoders
