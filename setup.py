@@ -90,7 +90,12 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [f'{name} = {PACKAGE}.tools.entry_points:{name}' for name in COMMANDS],
-        # The name is that of the module, so that `pytest_plugins` with it does not load it twice.
-        'pytest11': [f'{PACKAGE}.testing.fixtures = {PACKAGE}.testing.fixtures'],
+        # Each name is that of the module, so that `pytest_plugins` with it does not load it twice.
+        'pytest11': [
+            f'{module} = {module}'
+            for module in (f'{PACKAGE}.testing.fixtures', f'{PACKAGE}.robot_testing.fixtures')
+        ],
+        f'{PACKAGE}.fault_kinds': [f'robot = {PACKAGE}.robot_testing.fault_kinds:KINDS'],
+        f'{PACKAGE}.pictures': [f'run = {PACKAGE}.robot_testing.pictures:draw_run'],
     },
 )

@@ -32,7 +32,7 @@ from diffdrive_jacobian.exploration.scenario import ExplorationError, Scenario, 
 from diffdrive_jacobian.exploration.schedules import StopShrinking, generate, shrink, st, trials
 from diffdrive_jacobian.exploration.trial import Outcome, Setting, Trial, Violation
 from diffdrive_jacobian.numerics.checks import integer, number, positive_or_infinite
-from diffdrive_jacobian.properties import Property
+from diffdrive_jacobian.properties.base import Property
 from diffdrive_jacobian.signals import one_interrupt
 from diffdrive_jacobian.text import error_text
 
@@ -157,17 +157,18 @@ def _checked_properties(properties: Any) -> tuple[Property, ...]:
         raise ExplorationError(f'properties must be a list: [{properties!r}]')
     if not isinstance(properties, Iterable):
         raise ExplorationError(f'properties must be a list, got {properties!r}')
-    for one in properties:
+    checked = tuple(properties)
+    for one in checked:
         if not isinstance(one, Property):
             hint = '; create one: ' + one.__name__ + '(...)' if isinstance(one, type) else ''
             raise ExplorationError(f'properties must be instances of Property, got {one!r}{hint}')
-    keys = Counter(map(repr, properties))
+    keys = Counter(map(repr, checked))
     if twice := [key for key, count in keys.items() if count > 1]:
         raise ExplorationError(f'each property can be given once, got {twice[0]} again')
-    for one in properties:
+    for one in checked:
         # A test will contain it.
         Source().expression(one)
-    return tuple(properties)
+    return checked
 
 
 def _key_of(trial: Trial) -> str:

@@ -93,15 +93,16 @@ class Source:
 
 
 def _public(module: str, name: str) -> str:
-    """Return the package of a module of this package if the name is public there."""
-    package = '.'.join(module.split('.')[:2])
-    if module.startswith('diffdrive_jacobian.') and name in getattr(
-        sys.modules.get(package), '__all__', ()
-    ):
-        return package
+    """Return the package in which a name of a module of this package is public, or else the module."""
+    if module.startswith('diffdrive_jacobian.'):
+        for package in ('.'.join(module.split('.')[:2]), *PUBLIC):
+            if name in getattr(sys.modules.get(package), '__all__', ()):
+                return package
     return module
 
 
+PUBLIC = tuple(f'diffdrive_jacobian.{name}' for name in ('faults', 'properties', 'testing'))
+"""Packages whose names a written test may import."""
 Scenario = Callable[[Any, Any], object]
 """`scenario(world, case)` creates the nodes in a `Lockstep` and advances its time."""
 

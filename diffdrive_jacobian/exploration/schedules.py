@@ -14,11 +14,13 @@ import hashlib
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from diffdrive_jacobian import faults
 from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.exploration import extensions
+from diffdrive_jacobian.exploration.extensions import FAULT_KINDS
 from diffdrive_jacobian.exploration.scenario import ExplorationError
 from diffdrive_jacobian.exploration.trial import Trial
 from diffdrive_jacobian.faults import Fault
@@ -174,13 +176,8 @@ def _own_constants_only() -> Iterator[None]:
         cache.clear()
 
 
-Pose = tuple[float, float, float]
-Point = tuple[float, float]
-
 STEP = 0.1
 """Grid of times (s)."""
-ANGLES = (math.pi / 2, math.pi, -math.pi / 2, -math.pi, 3.14, -3.14, math.pi / 4, -math.pi / 4)
-"""Angles that are tried besides those of the grid (rad)."""
 
 
 def numbers(low: float, high: float, *, decimals: int = 1) -> st.SearchStrategy[float]:
@@ -217,51 +214,6 @@ def times(last: float) -> st.SearchStrategy[float]:
     return numbers(0.0, last, decimals=1)
 
 
-def angles() -> st.SearchStrategy[float]:
-    """Return a strategy of angles from -pi to pi (rad), in steps of 0.1, and the ends."""
-    return st.one_of(numbers(-3.1, 3.1), st.sampled_from(ANGLES))
-
-
-def points(extent: float = 5.0) -> st.SearchStrategy[Point]:
-    """Return a strategy of positions `(x, y)` with coordinates up to `extent` (m), in steps of 0.1."""
-    return st.tuples(numbers(-extent, extent), numbers(-extent, extent))
-
-
-def poses(extent: float = 5.0) -> st.SearchStrategy[Pose]:
-    """Return a strategy of poses `(x, y, theta)` (m, m, rad) with coordinates up to `extent`."""
-    return st.tuples(numbers(-extent, extent), numbers(-extent, extent), angles())
-
-
-def goals(extent: float = 5.0) -> st.SearchStrategy[Pose]:
-    """Return a strategy of goals `(x, y, theta)` (m, m, rad); the simplest is one metre ahead."""
-    return st.one_of(st.just((1.0, 0.0, 0.0)), poses(extent))
-
-
-def waypoints(
-    extent: float = 5.0, *, min_size: int = 1, max_size: int = 5
-) -> st.SearchStrategy[list[Pose]]:
-    """Return a strategy of lists of goals."""
-    return st.lists(goals(extent), min_size=min_size, max_size=max_size)
-
-
-def gains(low: float = 0.2, high: float = 5.0) -> st.SearchStrategy[float]:
-    """Return a strategy of positive gains: 1, 2, 5, 10, 0.5, ... and tenths in between.
-
-    Raises:
-        ValueError: `low` and `high` are not positive, or enclose no such gain.
-    """
-    if not 0.0 < low <= high < math.inf:
-        raise ValueError(f'low and high must be positive and low <= high, got {low!r} and {high!r}')
-    series = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
-    simple = [gain for gain in series if low <= gain <= high]
-    options = [st.sampled_from(simple)] if simple else []
-    if math.ceil(low * 10.0 - 1e-9) <= math.floor(high * 10.0 + 1e-9):
-        options.append(numbers(low, high))
-    if not options:
-        raise ValueError(f'no gain of 1, 2, 5, 10, ... or of tenths is between {low!r} and {high!r}')
-    return st.one_of(options)
-
-
 PROBABILITIES = (1.0, 0.5, *(round(0.05 * n, 2) for n in range(1, 20) if n != 10))
 """Probabilities in steps of 0.05. The simplest needs no random number."""
 
@@ -283,7 +235,6 @@ Hypothesis prefers values of fewer choices, so otherwise a loss would shrink to 
 """
 SHORT = (0.1, 0.5, 0.2, 0.05, 0.02, 0.01)
 """Durations of callbacks and of jitter that are tried (s)."""
-WHEELS = ('left', 'right')
 NUMBER_CHANGES = ('nan', 'inf', '-inf', 'negate', 'subnormal')
 """What happens to a number of a corrupted message."""
 RATES = (1.0, 2.0, 5.0, 10.0, 20.0, 0.5)
@@ -298,7 +249,9 @@ def _or_zero(longest: float) -> st.SearchStrategy[float]:
     return st.one_of(st.just(0.0), _positive(longest))
 
 
-KINDS: dict[str, dict[type[Fault], Callable[[], Fields]]] = {
+Kinds = dict[type[Fault], Callable[[], Fields]]
+
+KINDS: dict[str, Kinds] = {
     'topic': {
         faults.Loss: lambda: {
             'probability': probabilities(),
@@ -327,30 +280,6 @@ KINDS: dict[str, dict[type[Fault], Callable[[], Fields]]] = {
     'service': {
         faults.LateService: lambda: {'seconds': st.one_of(_positive(5.0), st.just(math.inf))},
     },
-    'robot': {
-        faults.Push: lambda: {
-            'noticed': st.booleans(),
-            'dtheta': numbers(-3.0, 3.0),
-            'dy': numbers(-1.0, 1.0),
-            'dx': numbers(-1.0, 1.0),
-        },
-        faults.DeadWheel: lambda: {'wheel': st.sampled_from(WHEELS)},
-        faults.SaturatedWheel: lambda: {
-            'wheel': st.sampled_from(WHEELS),
-            'max_velocity': numbers(0.1, 10.0),
-        },
-        faults.ActuatorLag: lambda: {'seconds': st.sampled_from(SHORT)},
-        faults.EncoderSteps: lambda: {'per_revolution': st.sampled_from((16, 64, 256, 1024))},
-        faults.Slip: dict,
-        faults.WrongGeometry: lambda: dict.fromkeys(
-            (
-                'left_wheel_radius_multiplier',
-                'right_wheel_radius_multiplier',
-                'wheel_separation_multiplier',
-            ),
-            st.sampled_from((1.0, 1.1, 0.9, 1.5, 0.5)),
-        ),
-    },
     'clock': {
         faults.ClockPause: dict,
         faults.TimeJump: lambda: {'seconds': st.one_of(_positive(10.0), numbers(-10.0, -STEP))},
@@ -368,10 +297,10 @@ def fault_schedules(
     duration: float = 10.0,
     *,
     services: Sequence[str] = (),
-    robots: Sequence[str] = (),
     fields: Mapping[str, Sequence[str]] | None = None,
     clock: bool = False,
     endless: bool = False,
+    **others: Sequence[str],
 ) -> st.SearchStrategy[list[Fault]]:
     """Return a strategy of lists of faults, for `explore(faults=...)`.
 
@@ -379,17 +308,17 @@ def fault_schedules(
         topics: Topics whose messages may be lost, late, repeated, ...
         nodes: Names of nodes that may be killed, frozen, slow, ...
         kinds: Kinds of faults, such as `[faults.Loss, faults.Delay]`, and strategies of faults. None:
-            all kinds of the given topics, nodes, services and robots.
+            all kinds of the given topics, nodes, services and others.
         max_faults: Largest number of faults.
         duration: Time at which all faults have ended (s). They begin and end in steps of 0.1 s.
         services: Services that may respond late or never.
-        robots: Names of virtual robots whose wheels, motors and encoders may fail, such as
-            `['virtual_robot']`.
         fields: Fields of messages that may be corrupted, by topic: `{'odom': ['pose.pose.position.x',
             'header.stamp', 'header.frame_id']}`. A number becomes NaN, infinite, ...,
             a stamp is shifted, a frame_id replaced. Other fields are taken for numbers.
         clock: Whether the clock may also jump and stand still, if `kinds` is None.
         endless: Whether faults may also last until the end of the run.
+        others: Names of what other faults affect, for which an installed distribution has kinds
+            (`exploration.extensions`): `robots=['virtual_robot']` for wheels, motors and encoders.
 
     Raises:
         ValueError: An argument is invalid; the message says which, and what is allowed.
@@ -399,7 +328,11 @@ def fault_schedules(
             "fields must be a dict of lists by topic, such as {'odom': ['pose.pose.position.x']}; "
             f'got {fields!r}'
         )
-    names = {'topic': topics, 'node': nodes, 'service': services, 'robot': robots}
+    own_kinds = dict(KINDS)
+    names = {'topic': topics, 'node': nodes, 'service': services}
+    for name, value in others.items():
+        target = name.removesuffix('s')
+        names[target], own_kinds[target] = value, _kinds_of_others(name)
     for target, value in names.items():
         check_names(f'{target}s', value)
     for topic, paths in (fields or {}).items():
@@ -408,25 +341,23 @@ def fault_schedules(
     between(STEP, unit='s')('duration', duration)
     if kinds is None:
         affected = [*(target for target in names if names[target]), *(['clock'] if clock else [])]
-        kinds = [kind for target in affected for kind in KINDS[target]]
+        kinds = [kind for target in affected for kind in own_kinds[target]]
         if not kinds and not fields:
-            raise ValueError('fault_schedules needs topics, nodes, services, robots, fields or kinds')
+            raise ValueError(f'fault_schedules needs {", ".join(_arguments())}, fields or kinds')
     strategies = []
     for kind in kinds:
         if isinstance(kind, st.SearchStrategy):
             strategies.append(kind)
             continue
-        target = next((target for target, known in KINDS.items() if kind in known), '')
+        target = next((target for target, known in own_kinds.items() if kind in known), '')
         if not target:
-            known_names = ', '.join(one.__name__ for known in KINDS.values() for one in known)
-            got = getattr(kind, '__name__', repr(kind))
-            raise ValueError(f'kinds must be among {known_names}, or strategies of faults; got {got}')
+            raise ValueError(_no_kind(kind, own_kinds))
         own = {}
         if target in names:
             if not names[target]:
                 raise ValueError(f'{kind.__name__} needs {target}s')
             own = {target: _one_of(names[target])}
-        strategies.append(_of_kind(kind, {**own, **KINDS[target][kind]()}, duration, endless))
+        strategies.append(_of_kind(kind, {**own, **own_kinds[target][kind]()}, duration, endless))
     for topic, paths in (fields or {}).items():
         for path in paths:
             strategies.append(_of_kind(faults.Corrupt, _corruption(topic, path), duration, endless))
@@ -439,6 +370,48 @@ def fault_schedules(
         return [draw(fault) for _ in range(draw(st.integers(0, max_faults)))]
 
     return draw_schedule()
+
+
+def _arguments() -> list[str]:
+    """Return the names of the arguments with names of what faults affect."""
+    others = [one for one in extensions.names(FAULT_KINDS) if one not in KINDS]
+    return [f'{one}s' for one in ('topic', 'node', 'service', *others)]
+
+
+def _kinds_of_others(name: str) -> Kinds:
+    """Return the kinds of faults that a distribution has for names given as an argument: 'robots'.
+
+    Raises:
+        ValueError: There is no such distribution.
+    """
+    if name not in _arguments():
+        raise ValueError(
+            f'fault_schedules has no argument {name!r}, and no installed distribution has faults for it '
+            f'(entry points of the group {FAULT_KINDS}); there are {", ".join(_arguments())}'
+        )
+    target = name.removesuffix('s')
+    kinds: Kinds = extensions.load(FAULT_KINDS, target)
+    valid = isinstance(kinds, Mapping) and all(
+        isinstance(kind, type) and issubclass(kind, Fault) and callable(fields)
+        for kind, fields in kinds.items()
+    )
+    if not valid:
+        raise ExplorationError(
+            f'the entry point {target} of {FAULT_KINDS} must be a dict of classes of faults with '
+            f'functions that return strategies of their fields, got {kinds!r:.200}'
+        )
+    return kinds
+
+
+def _no_kind(kind: Any, own_kinds: Mapping[str, Kinds]) -> str:
+    """Return why something is no kind of faults that can be drawn."""
+    for target in extensions.names(FAULT_KINDS):
+        with suppress(ExplorationError):
+            if target not in own_kinds and kind in _kinds_of_others(f'{target}s'):
+                return f'{kind.__name__} needs {target}s'
+    known = ', '.join(one.__name__ for kinds in own_kinds.values() for one in kinds)
+    got = getattr(kind, '__name__', repr(kind))
+    return f'kinds must be among {known}, or strategies of faults; got {got}'
 
 
 def _corruption(topic: str, path: str) -> Fields:

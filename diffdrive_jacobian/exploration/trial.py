@@ -20,6 +20,7 @@ import diffdrive_jacobian
 from diffdrive_jacobian.exploration.scenario import ScenarioName
 from diffdrive_jacobian.faults import Fault
 from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError, PropertyViolation
+from diffdrive_jacobian.lockstep._properties import answer
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.structure import (
     Array,
@@ -33,10 +34,9 @@ from diffdrive_jacobian.messages.structure import (
     walk,
 )
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
-from diffdrive_jacobian.properties import Property, Watch
+from diffdrive_jacobian.properties.base import Property
 from diffdrive_jacobian.ros.rclpy_internals import wrap_publish
 from diffdrive_jacobian.text import error_text, printable_lines
-from diffdrive_jacobian.time_units import NANOSECONDS
 
 QUIET = ('--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
 """ROS arguments of explored worlds. Logs of thousands of worlds help nobody, and take time."""
@@ -117,7 +117,7 @@ class _Collecting:
     def __init__(self, watched: Property, index: int, found: list[Violation], *, stop: bool) -> None:
         self._watched, self._index, self._found, self._stop = watched, index, found, stop
         self._world: Any = None
-        self._watch: Watch | None = None
+        self._watch: Property | None = None
         self.checks = 0
 
     def __repr__(self) -> str:
@@ -131,10 +131,10 @@ class _Collecting:
         if self._watch is None:
             return None
         self.checks += 1
-        return self._collected(self._watch.check())
+        return self._collected(answer(self._watch.check))
 
     def finish(self) -> str | None:
-        return None if self._watch is None else self._collected(self._watch.finish())
+        return None if self._watch is None else self._collected(answer(self._watch.finish))
 
     def _collected(self, text: str | None) -> str | None:
         if text is None:
@@ -144,17 +144,12 @@ class _Collecting:
             Violation(
                 key=printable_lines(repr(self._watched)),
                 name=type(self._watched).__name__,
-                seconds=seconds(self._world),
+                seconds=self._world.world_seconds,
                 text=printable_lines(text)[:LONGEST_TEXT],
                 index=self._index,
             )
         )
         return text if self._stop else None
-
-
-def seconds(world: Lockstep) -> float:
-    """Return the world time (s)."""
-    return world.world_time / NANOSECONDS
 
 
 def run(
@@ -171,7 +166,7 @@ def run(
         setting: What all worlds have in common.
         trial: The case and the faults.
         only: Index of the one property to check, whose violation ends the world; None: all of them,
-            and the world goes on after a violation. -1: none, only exceptions count.
+            and the world goes on after a violation. -1: only exceptions count, also of properties.
         digest: Whether to compute the hash of all messages.
         during: Returns a context manager in which the world is run.
 
@@ -183,9 +178,9 @@ def run(
     violations: list[Violation] = []
     complaints: tuple[str, ...] = ()
     properties = [
-        _Collecting(one, index, violations, stop=only is not None)
+        _Collecting(one, index, violations, stop=only == index)
         for index, one in enumerate(setting.properties)
-        if only in (None, index)
+        if only in (None, -1, index)
     ]
     arguments = [*(setting.args or ['--ros-args']), '--ros-args', *QUIET]
     with Lockstep(arguments) as world, during(world):
@@ -205,9 +200,9 @@ def run(
                 if not isinstance(getattr(error, 'property', None), _Collecting):
                     violations.append(of_exception(error, world))
         return Outcome(
-            violations=tuple(violations),
+            violations=tuple(one for one in violations if only != -1 or one.index < 0),
             checks=sum(one.checks for one in properties),
-            seconds=seconds(world),
+            seconds=world.world_seconds,
             complaints=complaints,
             digest='' if messages is None else messages.value(),
         )
@@ -239,7 +234,7 @@ def of_exception(error: BaseException, world: Lockstep) -> Violation:
     return Violation(
         key=printable_lines(key),
         name=f'NoException{kind}',
-        seconds=seconds(world),
+        seconds=world.world_seconds,
         text=printable_lines(text)[-LONGEST_TEXT:],
         message=f'{kind}: {first}'[:LONGEST_LINE] if first else kind,
     )
@@ -307,9 +302,14 @@ class MessageDigest:
         return self._hash.hexdigest()[:32]
 
     def _add(self, publisher: Publisher, message: Any) -> None:
-        if isinstance(message, bytes):
-            message = deserialize_message(message, publisher.msg_type)
         words = [str(self._world.now), publisher.topic_name]
+        if isinstance(message, bytes):
+            try:
+                message = deserialize_message(message, publisher.msg_type)
+            except RuntimeError:
+                # No message: nothing in it is padding.
+                self._hash.update('\0'.join([*words, message.hex()]).encode())
+                return
         for _, kind, value in walk(structure(type(message)), message, whole=is_identifier):
             words += self._words(kind, value)
         self._hash.update('\0'.join(words).encode())

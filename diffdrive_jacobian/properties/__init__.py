@@ -9,37 +9,43 @@
         world.finish()
 
 A violation is raised as a `testing.PropertyViolation` by the method that advanced time. For properties
-of your own, derive from `Property` and `Watch`.
+of your own, derive from `Property`. Those of a robot are imported on first use.
 """
 
-from diffdrive_jacobian.properties.base import Property, Watch
-from diffdrive_jacobian.properties.goals import (
-    ArrivesOnceFaultsEnd,
-    KeepsDriving,
-    NoCommandAfterCancel,
-    NoStaleGoals,
-    ReachesGoal,
-    Settles,
-    StatusProtocol,
-    end_of_faults,
-)
-from diffdrive_jacobian.properties.motion import (
-    AccelerationWithin,
-    NeverFasterThan,
-    PoseFinite,
-    StaysNear,
-    StaysOnPath,
-    StaysWithin,
-)
-from diffdrive_jacobian.properties.stopping import (
-    StopsAfterLastCommand,
-    StopsAfterLostOdometry,
-    StopsOnShutdown,
-)
+from typing import TYPE_CHECKING
+
+from diffdrive_jacobian import lazy
+from diffdrive_jacobian.properties.base import Property, end_of_faults
+from diffdrive_jacobian.properties.field_within import FieldWithin
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.robot_testing.goals import (
+        ArrivesOnceFaultsEnd,
+        KeepsDriving,
+        NoCommandAfterCancel,
+        NoStaleGoals,
+        ReachesGoal,
+        Settles,
+        StatusProtocol,
+    )
+    from diffdrive_jacobian.robot_testing.motion import (
+        AccelerationWithin,
+        NeverFasterThan,
+        PoseFinite,
+        StaysNear,
+        StaysOnPath,
+        StaysWithin,
+    )
+    from diffdrive_jacobian.robot_testing.stopping import (
+        StopsAfterLastCommand,
+        StopsAfterLostOdometry,
+        StopsOnShutdown,
+    )
 
 __all__ = [
     'AccelerationWithin',
     'ArrivesOnceFaultsEnd',
+    'FieldWithin',
     'KeepsDriving',
     'NeverFasterThan',
     'NoCommandAfterCancel',
@@ -55,6 +61,22 @@ __all__ = [
     'StopsAfterLastCommand',
     'StopsAfterLostOdometry',
     'StopsOnShutdown',
-    'Watch',
     'end_of_faults',
 ]
+
+_MODULES = {
+    'robot_testing.goals': (
+        *('ArrivesOnceFaultsEnd', 'KeepsDriving', 'NoCommandAfterCancel', 'NoStaleGoals'),
+        *('ReachesGoal', 'Settles', 'StatusProtocol'),
+    ),
+    'robot_testing.motion': (
+        *('AccelerationWithin', 'NeverFasterThan', 'PoseFinite'),
+        *('StaysNear', 'StaysOnPath', 'StaysWithin'),
+    ),
+    'robot_testing.stopping': (*('StopsAfterLastCommand', 'StopsAfterLostOdometry', 'StopsOnShutdown'),),
+}
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy.attach(
+        __name__, {name: module for module, names in _MODULES.items() for name in names}
+    )

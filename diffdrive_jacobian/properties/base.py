@@ -1,34 +1,44 @@
-"""The base classes of all properties."""
+"""What a property is. `Lockstep.require` requires one of a run."""
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 
-from diffdrive_jacobian.faults.fault import Expression, RosName
+from diffdrive_jacobian.faults.fault import Expression
+from diffdrive_jacobian.lockstep._errors import LockstepError, raised
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.names import full_name
-from diffdrive_jacobian.properties._messages import Pose, Twist, read_pose, read_twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 RECENT = 5
 """Number of messages that a violation lists."""
 ROUNDING = 1e-9
 """Tolerance on times (s) and distances (m)."""
+OF_PROPERTIES = ('world', '_recent', '_found', '_owners', '_names')
+"""Attributes of a property that observes a run."""
+P = TypeVar('P', bound='Property')
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class Property(Expression, ABC):
-    """Something that must hold in a run of a `Lockstep`. Required by `Lockstep.require`.
+    """Something that must hold in a run of a `Lockstep`. Base class.
 
-    A property is a value. It can be compared, pickled, and printed as the expression that makes it. What
-    it observes of a run is in the Watch that `watch` returns.
+    A property is a value: it can be compared, pickled, and printed as the expression that makes it. A
+    copy of it observes the run. `begin` says what it observes, and sets attributes for what it has seen,
+    which are no fields of the dataclass. Subclasses are decorated with `@dataclass(repr=False)`.
+
+    What is violated is noted by `found`, or returned by `check` or `finish`, and raised by `Lockstep`. A
+    property that raises an exception is violated, too.
 
     Attributes:
         namespace: Namespace of the topics, such as '/robot1' (default: that of the `Lockstep`).
@@ -36,36 +46,35 @@ class Property(Expression, ABC):
 
     namespace: str = field(default='', kw_only=True)
 
-    @abstractmethod
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run, and return what observes it."""
+    def watch(self: P, world: Lockstep) -> P:
+        """Return a copy that observes a run. `Lockstep.require` calls it."""
+        kind = type(self)
+        if '__init__' in vars(kind) and '__dataclass_fields__' not in vars(kind):
+            raise LockstepError(f'{kind.__name__} must be decorated with @dataclass(repr=False)')
+        observing = deepcopy(self)
+        observing._start(world)
+        return observing
 
-    def resolved(self, name: str) -> str:
-        """Return the name of a topic or service with the namespace of this property."""
-        if not self.namespace or name.startswith('/'):
-            return name
-        return full_name(self.namespace, name)
+    def __init_subclass__(cls) -> None:
+        """Refuse fields with the names of what a property has."""
+        super().__init_subclass__()
+        for name in inspect.get_annotations(cls):
+            if name in OF_PROPERTIES or (name != 'namespace' and hasattr(Property, name)):
+                raise TypeError(f'{cls.__name__}.{name}: each property has something of this name')
 
-
-class Watch:
-    """What observes one run for one property. Base class.
-
-    What it observes it stores. The methods return violations, which `Lockstep` raises: an exception
-    within an observing function would be raised in the node that publishes.
-    """
-
-    def __init__(self, world: Lockstep) -> None:
-        """Observe a run."""
+    def _start(self, world: Lockstep) -> None:
         self.world = world
         self._recent: deque[tuple[int, tuple[object, ...]]] = deque(maxlen=RECENT)
         self._found: str | None = None
         self._owners: dict[Publisher, Node] = {}
         self._names: dict[Node, str] = {}
+        self.begin()
 
-    @property
-    def seconds(self) -> float:
-        """World time since the start of the `Lockstep` (s)."""
-        return self.world.world_time / NANOSECONDS
+    # --- What a property defines
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Begin to observe `self.world`, with `on_published` and so on."""
 
     def check(self) -> str | None:
         """Return what is violated at the current time, after all callbacks; None: nothing."""
@@ -74,6 +83,98 @@ class Watch:
     def finish(self) -> str | None:
         """Return what is violated at the end of the run; None: nothing."""
         return None
+
+    # --- Observing
+
+    def on_published(
+        self,
+        topic: str,
+        observe: Callable[[Publisher, Any], None],
+        *,
+        optional: bool = False,
+        raw: bool = False,
+    ) -> str:
+        """Call a function with the publisher and the message after each message of a topic is published.
+
+        Bytes that are no message are a violation.
+
+        Args:
+            topic: Name of the topic.
+            observe: The function.
+            optional: Whether no node needs to offer the topic. It is an error otherwise.
+            raw: Whether serialized messages remain bytes, whatever they are.
+
+        Returns:
+            The full name of the topic.
+        """
+        if not optional:
+            self.world.expect(self.resolved(topic))
+
+        def observe_decoded(publisher: Publisher, message: Any) -> None:
+            if (decoded := self._decoded(publisher.msg_type, message, topic)) is not None:
+                self._call(observe, publisher, decoded)
+
+        return self.world.on_published(self.resolved(topic), observe if raw else observe_decoded)
+
+    def on_delivered(
+        self,
+        topic: str,
+        observe: Callable[[Node, Any, Any], None],
+        *,
+        optional: bool = False,
+        raw: bool = False,
+    ) -> str:
+        """Call a function with each message of a topic that the nodes receive, before their callbacks.
+
+        The function receives the node, the type of the message, and the message. The rest is as of
+        `on_published`.
+        """
+        if not optional:
+            self.world.expect(self.resolved(topic))
+
+        def observe_decoded(node: Node, message_type: Any, message: Any) -> None:
+            if (decoded := self._decoded(message_type, message, topic)) is not None:
+                self._call(observe, node, message_type, decoded)
+
+        return self.world.on_delivered(self.resolved(topic), observe if raw else observe_decoded)
+
+    def _decoded(self, message_type: Any, message: Any, topic: str) -> Any:
+        """Return a message that may be serialized. None: it is invalid, which is a violation."""
+        if not isinstance(message, bytes):
+            return message
+        try:
+            return deserialize_message(message, message_type)
+        except RuntimeError:
+            self.found(f'{self.resolved(topic)}: bytes that are no {message_type.__name__}')
+            return None
+
+    def on_response(self, service: str, observe: Callable[[Node, Any], None]) -> str:
+        """Call a function with the node and each response of a service. Return its full name."""
+
+        def observe_safely(node: Node, response: Any) -> None:
+            self._call(observe, node, response)
+
+        return self.world.on_response(self.resolved(service), observe_safely)
+
+    def _call(self, observe: Callable[..., None], *args: Any) -> None:
+        """Call a function that observes. An exception of it is not one of the node that publishes."""
+        try:
+            observe(*args)
+        except LockstepError:
+            raise
+        except Exception as error:
+            self.found(raised(error))
+
+    def resolved(self, name: str) -> str:
+        """Return the name of a topic or service with the namespace of this property."""
+        if not self.namespace or name.startswith('/'):
+            return name
+        return full_name(self.namespace, name)
+
+    @property
+    def world_seconds(self) -> float:
+        """World time since the start of the `Lockstep` (s)."""
+        return self.world.world_seconds
 
     def owner(self, publisher: Publisher) -> Node | None:
         """Return the node that has a publisher; None: it was removed, or not added yet."""
@@ -89,6 +190,8 @@ class Watch:
         if node not in self._names:
             self._names[node] = node.get_fully_qualified_name()
         return self._names[node]
+
+    # --- Describing
 
     def note(self, *parts: object) -> None:
         """Note something that happened, for the description of a violation.
@@ -110,63 +213,10 @@ class Watch:
         return '\n'.join([text, *(['before that:'] if notes else []), *notes])
 
 
-P = TypeVar('P', bound=Property)
+def end_of_faults(world: Lockstep) -> float:
+    """Return the world time at which all faults have ended, and what they delayed has arrived (s).
 
-
-class PropertyWatch(Watch, Generic[P]):
-    """A watch that knows its property, and observes the topics that this names."""
-
-    def __init__(self, required: P, world: Lockstep) -> None:
-        """Observe a run."""
-        super().__init__(world)
-        self.required = required
-
-    def on_published(self, topic: str, observe: Callable[[Publisher, Any], None]) -> str:
-        """Observe a topic, which some node must offer. Return its full name."""
-        self.world.expect(self.required.resolved(topic))
-        return self.world.on_published(self.required.resolved(topic), observe)
-
-    def on_delivered(self, topic: str, observe: Callable[[Node, Any, Any], None]) -> str:
-        """Observe what is received of a topic, which some node must offer. Return its full name."""
-        self.world.expect(self.required.resolved(topic))
-        return self.world.on_delivered(self.required.resolved(topic), observe)
-
-
-@dataclass(frozen=True, repr=False)
-class MotionProperty(Property):
-    """A property of the motion in the odometry. Base class.
-
-    Attributes:
-        odom: Topic of type Odometry (default: 'odom'). 'ground_truth' for the true pose of a virtual
-            robot that drifts.
+    Infinite: one of them has no end. Faults of one topic may delay a message one after the other.
     """
-
-    odom: RosName = field(default='odom', kw_only=True)
-
-
-M = TypeVar('M', bound=MotionProperty)
-
-
-class MotionWatch(PropertyWatch[M]):
-    """A watch of the last pose and twist in the odometry."""
-
-    def __init__(self, required: M, world: Lockstep) -> None:
-        """Observe a run."""
-        super().__init__(required, world)
-        self.pose: Pose | None = None
-        self.twist: Twist | None = None
-        self.odom = self.on_published(required.odom, self._on_odometry)
-
-    def _on_odometry(self, publisher: Publisher, message: Any) -> None:
-        self.pose = read_pose(publisher.msg_type, message)
-        self.twist = read_twist(publisher.msg_type, message)
-        if self.pose is None or self.twist is None:
-            self.on_invalid()
-        else:
-            self.on_motion(self.pose, self.twist)
-
-    def on_motion(self, pose: Pose, twist: Twist) -> None:
-        """Receive a message of the odometry."""
-
-    def on_invalid(self) -> None:
-        """Receive bytes that are no Odometry."""
+    end = max((fault.end for fault in world.faults), default=0.0)
+    return float(end + sum(fault.longest_delay for fault in world.faults))

@@ -27,16 +27,10 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.exploration.result import Exploration, Finding, Replay, reproducing
     from diffdrive_jacobian.exploration.scenario import ExplorationError, scenario_from
     from diffdrive_jacobian.exploration.schedules import (
-        angles,
         fault_schedules,
-        gains,
-        goals,
         numbers,
-        points,
-        poses,
         probabilities,
         times,
-        waypoints,
     )
     from diffdrive_jacobian.lockstep._errors import (
         IneffectiveFaultsError,
@@ -46,6 +40,14 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep.external.node_process import NodeProcess
     from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.nodes.goal_client import path_message
+    from diffdrive_jacobian.robot_testing.strategies import (
+        angles,
+        gains,
+        goals,
+        points,
+        poses,
+        waypoints,
+    )
     from diffdrive_jacobian.testing.recorded_run import GoldenRun, RecordedRun
     from diffdrive_jacobian.testing.repeats import check_repeats
 
@@ -85,14 +87,12 @@ _MODULES = {
     'exploration.exploring': ('explore',),
     'exploration.processes': ('LocalExecutor', 'SerialExecutor'),
     'exploration.result': ('Exploration', 'Finding', 'Replay', 'reproducing'),
-    'exploration.schedules': (
-        *('angles', 'gains', 'goals', 'numbers', 'points', 'poses', 'probabilities', 'times'),
-        *('fault_schedules', 'waypoints'),
-    ),
+    'exploration.schedules': ('fault_schedules', 'numbers', 'probabilities', 'times'),
     'lockstep._errors': ('IneffectiveFaultsError', 'LockstepError', 'PropertyViolation'),
     'lockstep.external.node_process': ('NodeProcess',),
     'lockstep.world': ('Lockstep',),
     'nodes.goal_client': ('path_message',),
+    'robot_testing.strategies': ('angles', 'gains', 'goals', 'points', 'poses', 'waypoints'),
     'testing.recorded_run': ('GoldenRun', 'RecordedRun'),
     'testing.repeats': ('check_repeats',),
 }

@@ -1,9 +1,9 @@
 """The plugin of pytest. It is loaded by its entry point, wherever this package is installed.
 
-`lockstep` is a new `Lockstep` for each test. `robot_at(x, y, theta)` adds a virtual robot to it.
-`recorded_run` records the test as a bag and a figure, which are kept if it fails. `golden_run` compares
-the test with a recorded run. The marker `lockstep(args=..., start=..., patience=...)` passes arguments
-to `Lockstep`. The report of a failed test ends with the last messages of all topics.
+`lockstep` is a new `Lockstep` for each test. `recorded_run` records the test as a bag and a figure that
+are kept if it fails. `golden_run` compares the test with a recorded run. The marker `lockstep(args=...,
+start=..., patience=...)` passes arguments to `Lockstep`. The report of a failed test ends with the last
+messages of all topics.
 
 pytest loads this module in every project. Until a fixture is used it imports neither rclpy nor NumPy and
 leaves the environment as it is.
@@ -24,7 +24,6 @@ import pytest
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep.world import Lockstep
-    from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
     from diffdrive_jacobian.testing.recorded_run import GoldenRun, RecordedRun
 
 MAX_LENGTH = 120
@@ -264,31 +263,6 @@ def _remedy(error: ImportError) -> str:
         'source the setup file of a ROS 2 Jazzy installation (. /opt/ros/jazzy/setup.bash), or call '
         "pip install '.[jazzy]' in a clone of diffdrive_jacobian"
     )
-
-
-@pytest.fixture
-def robot_at(lockstep: Lockstep) -> Callable[..., VirtualRobot]:
-    """Return a function that adds a virtual robot with a pose, a namespace and parameters.
-
-    A parameter is given by its name, with `__` for each dot. TypeError: there is no such parameter.
-    """
-    from rclpy.parameter import Parameter
-
-    from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-    from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
-
-    def place(
-        x: float = 0.0, y: float = 0.0, theta: float = 0.0, *, namespace: str = '', **parameters: Any
-    ) -> VirtualRobot:
-        values = {'x': float(x), 'y': float(y), 'theta': float(theta)}
-        values |= {name.replace('__', '.'): value for name, value in parameters.items()}
-        known = VirtualRobotParameters().declared()
-        if unknown := sorted(set(values) - set(known)):
-            raise TypeError(f'virtual_robot has no parameter {unknown[0]!r}; it has {", ".join(known)}')
-        overrides = [Parameter(name, value=value) for name, value in values.items()]
-        return lockstep.create(lambda: VirtualRobot(namespace=namespace, parameter_overrides=overrides))
-
-    return place
 
 
 @pytest.fixture

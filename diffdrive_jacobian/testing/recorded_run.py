@@ -21,8 +21,9 @@ from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import Channel, Message, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
-from diffdrive_jacobian.bags.run import read_run
 from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.exploration.extensions import draw
+from diffdrive_jacobian.exploration.recorded_world import record_world
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.structure import (
     COUNT,
@@ -34,10 +35,8 @@ from diffdrive_jacobian.messages.structure import (
     structure,
     walk,
 )
-from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TRANSFORMS, Selection
+from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TRANSFORMS
 from diffdrive_jacobian.numerics.checks import between
-from diffdrive_jacobian.plots.run_figure import draw
-from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -76,14 +75,7 @@ class RecordedRun:
         self._finished = False
         self._error: RecordingError | None = None
         self._kept: str | None = None
-        # With world time the order remains where the clock of the nodes jumps back.
-        offset = world.now - world.world_time
-        recorder = Recorder(
-            Selection(everything=True), self._recording, now=lambda: offset + world.world_time
-        )
-        world.add(recorder, observer=True)
-        world.on_new_topics(recorder.discover)
-        recorder.discover()
+        record_world(world, self._recording)
 
     @property
     def bag(self) -> Path:
@@ -109,10 +101,10 @@ class RecordedRun:
         return self.bag
 
     def keep(self) -> str:
-        """End the recording as `finish` does and keep it, with a figure if there is odometry.
+        """End the recording as `finish` does and keep it, with a figure if somebody can draw it.
 
         Returns:
-            The paths of the bag and of the figure, in two lines.
+            The path of the bag, and in a second line that of the figure, if there is one.
 
         Raises:
             RecordingError: The recording is not complete.
@@ -120,11 +112,9 @@ class RecordedRun:
         self.finish()
         if self._kept is None:
             picture = _figure_of(self.bag)
-            try:
-                draw([read_run(self.bag)], picture)
-                self._kept = f'{self.bag}\n{picture}'
-            except (BagError, ModuleNotFoundError, OSError) as error:
-                self._kept = f'{self.bag}\nnot drawn: {error}'
+            why = draw(self.bag, picture)
+            drawn = f'not drawn: {why}' if why else str(picture)
+            self._kept = str(self.bag) if why is None else f'{self.bag}\n{drawn}'
         return self._kept
 
     def close(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from itertools import zip_longest
 from typing import Any
 
@@ -27,7 +28,8 @@ class _Messages(MessageDigest):
     def _add(self, publisher: Publisher, message: Any) -> None:
         super()._add(publisher, message)
         if isinstance(message, bytes):
-            message = deserialize_message(message, publisher.msg_type)
+            with suppress(RuntimeError):
+                message = deserialize_message(message, publisher.msg_type)
         self.all.append((self._world.now, publisher.topic_name, brief(message), self.value()))
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import pytest
 from exploration_scenarios import Follower, Sensor, failing, moving, robot, serial
+from geometry_msgs.msg import Twist
 from hypothesis import strategies as st
 
 from diffdrive_jacobian.bags.bag_reader import open_bag
@@ -20,7 +21,7 @@ from diffdrive_jacobian.exploration.processes import _picklable
 from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.plots.run_figure import VIOLATION
-from diffdrive_jacobian.properties import NeverFasterThan, Property, StaysNear, Watch
+from diffdrive_jacobian.properties import FieldWithin, NeverFasterThan, Property, StaysNear
 from diffdrive_jacobian.testing import (
     ExplorationError,
     Lockstep,
@@ -179,8 +180,8 @@ def test_a_case_a_bag_and_a_test_are_written_and_an_exception_is_described_by_it
     assert case['versions']['python']
     with open_bag(folder / 'run') as bag:
         assert {'/speed', '/cmd_vel', '/fault_events'} <= {one.topic for one in bag.connections}
-    # There is no odometry.
-    assert 'no picture' in finding.notes[0]
+    # There is no odometry, so nobody can draw it.
+    assert finding.notes == ()
     source = (folder / 'test_no_exception_lockstep_error.py').read_text()
     assert source.startswith(f'"""{finding.violation.key}, at 0.3 s.\n\n{expected}\n\n')
     # What the test imports, it uses.
@@ -204,16 +205,14 @@ class SilentError(Exception):
     __repr__ = __str__
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class Garbled(Property):
     """Is never satisfied, and says so with characters that no file of Python may contain."""
 
     text: str
 
-    def watch(self, world):
-        watch = Watch(world)
-        watch.found(self.text)
-        return watch
+    def begin(self):
+        self.found(self.text)
 
 
 UNPRINTABLE = '"""a\0\x1b\ud800\\N{x}\ud83d"'
@@ -246,6 +245,41 @@ def test_whatever_an_error_is_its_finding_is_kept(tmp_path, case):
     assert module['CASE'] == case
     kinds = (PropertyViolation, ValueError, KeyError, SilentError)
     with Lockstep() as world, pytest.raises(kinds) as error:
+        module[file.stem](world)
+    assert 'the same as found, bit for bit' in error.value.__notes__[0]
+
+
+@dataclass(repr=False)
+class RaisesItself(Property):
+    """Raises an error where it observes."""
+
+    topic: str
+
+    def begin(self):
+        self.on_published(self.topic, lambda publisher, message: message.no_such_field)
+
+
+def invalid(world, case):
+    """Publish bytes that are no message."""
+    world.node.create_publisher(Twist, 'cmd_vel', 10).publish(b'\0')
+    world.run_for(0.1)
+    world.node.create_publisher(Twist, 'cmd_vel', 10).publish(Twist())
+    world.run_for(0.1)
+
+
+@pytest.mark.parametrize(
+    'required', [RaisesItself('cmd_vel'), FieldWithin('cmd_vel', 'linear.x', -1.0, 1.0)], ids=str
+)
+def test_properties_that_raise_and_bytes_that_are_no_message_are_found_and_reproduced(
+    tmp_path, required
+):
+    (finding,) = serial(invalid, [required], worlds=1, output=tmp_path).findings
+    assert finding.violation.index == 0
+    assert finding.deterministic
+    (file,) = finding.directory.glob('test_*.py')
+    module = {'__file__': str(file)}
+    exec(compile(file.read_bytes(), file, 'exec'), module)
+    with Lockstep() as world, pytest.raises(PropertyViolation) as error:
         module[file.stem](world)
     assert 'the same as found, bit for bit' in error.value.__notes__[0]
 

@@ -20,6 +20,7 @@ from diffdrive_jacobian.faults import EncoderSteps
 from diffdrive_jacobian.testing.fixtures import MAX_LENGTH, artifact_name, name_beside_the_file
 
 PLUGIN = 'diffdrive_jacobian.testing.fixtures'
+OF_ROBOTS = 'diffdrive_jacobian.robot_testing.fixtures'
 
 
 @pytest.fixture
@@ -77,8 +78,8 @@ def test_the_plugin_does_nothing_in_projects_without_ros(pytester):
     found = json.loads((pytester.path / 'found.json').read_text())
     assert found['wanted'] == []
     ours = {name for name in found['modules'] if name.startswith('diffdrive_jacobian')}
-    parents = {'diffdrive_jacobian', 'diffdrive_jacobian.lazy', 'diffdrive_jacobian.testing'}
-    assert ours == {*parents, PLUGIN}
+    packages = {PLUGIN.rpartition('.')[0], OF_ROBOTS.rpartition('.')[0]}
+    assert ours == {'diffdrive_jacobian', 'diffdrive_jacobian.lazy', *packages, PLUGIN, OF_ROBOTS}
     changed = {name for name, value in found['env'].items() if before.get(name) != value}
     assert all(name.startswith('PYTEST_') for name in changed)
     assert before.keys() <= found['env'].keys()
@@ -266,12 +267,13 @@ FAILURES = """
     def test_is_not_set_up(driving):
         pass
 
-    @dataclass(frozen=True, repr=False)
+    @dataclass(repr=False)
     class Ends(properties.Property):
-        def watch(self, world):
-            watch = properties.Watch(world)
-            watch.finish = lambda: 'it never ends'
-            return watch
+        def begin(self):
+            pass
+
+        def finish(self):
+            return 'it never ends'
 
     def test_ends(lockstep, robot_at, recorded_run):
         robot_at()

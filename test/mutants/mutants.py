@@ -52,6 +52,7 @@ PACKAGES = (
     *('kinematics', 'control', 'simulation', 'calibration'),
     *('messages', 'lockstep', 'bags', 'recording'),
     *('nodes', 'ros', 'parameters', 'numerics', 'properties', 'faults', 'exploration', 'testing'),
+    'robot_testing',
     *('tools', 'live', 'plots'),
 )
 LEFT_OUT = {

@@ -108,6 +108,8 @@ VIOLATED = [
     (ReachesGoal(2.0, tolerance=0.03), ARRIVES, 'allowed: within 0.03 m and standing'),
     (ReachesGoal(1.0), [goal_at(1.0), 1.5], 'there was no odometry on /odom'),
     (ReachesGoal(1.0), [odometry_at(1.0, v=0.1), goal_at(1.0), 1.5], r'robot is 0 m .* v 0.1 m/s'),
+    # It creeps.
+    (ReachesGoal(1.0), [goal_at(1.0), odometry_at(1.0, v=0.02), 1.5], r'robot is 0 m .* v 0.02 m/s'),
     (ReachesGoal(1.0, yaw_tolerance=0.1), [goal_at(1.0), odometry_at(1.0, theta=3.1), 2.0], '3.1 rad'),
     (ReachesGoal(2.0), [goal_at(1.0), odometry_at(0.0), 1.0], r'the run ended 1 s after .* run for 2 s'),
     (Settles(1.0, 0.1), [goal_at(1.0), 1.1, odometry_at(0.5), 0.1], '0.5 m from the'),
@@ -135,7 +137,11 @@ VIOLATED = [
     (NoStaleGoals(), accepted(1, 2, 2), r'ACCEPTED of the goal with stamp 2\.0+ s, after one'),
     (FROM_AFTER, [STRAIGHT, odometry_at(0.0, 1.0), odometry_at(0.5, -0.1001)], 'allowed'),
     (FROM_AFTER, [STRAIGHT, odometry_at(nan, 0.0)], 'allowed'),
-    (IN_TIME, [odometry_at(0.0), STRAIGHT, odometry_at(0.5), 1.1], '1 s after the path was published'),
+    (
+        IN_TIME,
+        [odometry_at(0.0), STRAIGHT, odometry_at(0.5), 1.1],
+        ' s: 1 s after the path was published',
+    ),
     (IN_TIME, [STRAIGHT, odometry_at(0.2), 0.5], r'the run ended 0.5 s after the path .* 0.2 m along'),
 ]
 

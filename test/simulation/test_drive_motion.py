@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.control import VelocityLimits
-from diffdrive_jacobian.faults.robot import ActuatorLag
+from diffdrive_jacobian.robot_testing.faults import ActuatorLag
 from diffdrive_jacobian.simulation import Robot, RobotModel, quadrature_moments
 from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 from diffdrive_jacobian.simulation.slip import Drift

@@ -14,7 +14,6 @@ from rclpy.publisher import Publisher
 from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.control.path import PathProgress
 from diffdrive_jacobian.faults.fault import RosName
-from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.codecs import PATH
 from diffdrive_jacobian.messages.conversion import MAX_POSITION, MessageError
 from diffdrive_jacobian.numerics.checks import (
@@ -24,22 +23,17 @@ from diffdrive_jacobian.numerics.checks import (
     Positive,
     PositiveOrInfinite,
 )
-from diffdrive_jacobian.properties._messages import Pose, Twist, field_reader, read_twist
-from diffdrive_jacobian.properties.base import (
-    ROUNDING,
-    MotionProperty,
-    MotionWatch,
-    Property,
-    PropertyWatch,
-    Watch,
-)
+from diffdrive_jacobian.properties.base import ROUNDING, Property
+from diffdrive_jacobian.properties.fields import field_reader
+from diffdrive_jacobian.robot_testing.odometry import MotionProperty
+from diffdrive_jacobian.robot_testing.readings import Pose, Twist, read_twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MARGIN = 1e-9
 """Relative margin for rounding."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class TwistProperty(Property):
     """A property of the twists on a topic, which are limited. Base class.
 
@@ -55,7 +49,7 @@ class TwistProperty(Property):
     topic: RosName = field(default='cmd_vel', kw_only=True)
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class NeverFasterThan(TwistProperty):
     """No twist on a topic is faster than a limit: `|linear.x| <= v` and `|angular.z| <= omega`.
 
@@ -64,16 +58,10 @@ class NeverFasterThan(TwistProperty):
     rounding.
     """
 
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _SpeedWatch(self, world)
-
-
-class _SpeedWatch(PropertyWatch[NeverFasterThan]):
-    def __init__(self, required: NeverFasterThan, world: Lockstep) -> None:
-        super().__init__(required, world)
-        self._limits = required.v * (1.0 + MARGIN), required.omega * (1.0 + MARGIN)
-        self._topic = self.on_published(required.topic, self._on_message)
+    def begin(self) -> None:
+        """Begin to observe the twists."""
+        self._limits = self.v * (1.0 + MARGIN), self.omega * (1.0 + MARGIN)
+        self._topic = self.on_published(self.topic, self._on_message, raw=True)
 
     def _on_message(self, publisher: Publisher, message: Any) -> None:
         twist = read_twist(publisher.msg_type, message)
@@ -81,13 +69,13 @@ class _SpeedWatch(PropertyWatch[NeverFasterThan]):
             self.found(f'{self._topic}: bytes that are no {publisher.msg_type.__name__}')
         elif not twist.is_within(*self._limits):
             self.found(
-                f'{self._topic}: {twist}; allowed: |v| <= {self.required.v:g} m/s, '
-                f'|omega| <= {self.required.omega:g} rad/s'
+                f'{self._topic}: {twist}; allowed: |v| <= {self.v:g} m/s, '
+                f'|omega| <= {self.omega:g} rad/s'
             )
         self.note(self._topic, ': ', twist)
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class AccelerationWithin(TwistProperty):
     """The twists on a topic change at limited rates: by `v` m/s and `omega` rad/s per second.
 
@@ -107,9 +95,34 @@ class AccelerationWithin(TwistProperty):
     slack: Positive = field(default=0.1, kw_only=True)
     stops: bool = field(default=True, kw_only=True)
 
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _AccelerationWatch(self, world)
+    def begin(self) -> None:
+        """Begin to observe the twists."""
+        self._start_of_all = _Last(
+            Twist(0.0, 0.0), self.world_seconds, self.world.now, self.slack, self.slack
+        )
+        self._last: dict[Publisher, _Last] = {}
+        self._topic = self.on_published(self.topic, self._on_message, raw=True)
+
+    def _on_message(self, publisher: Publisher, message: Any) -> None:
+        last = self._last.get(publisher, self._start_of_all)
+        twist = read_twist(publisher.msg_type, message)
+        if twist is None or not math.isfinite(twist.v + twist.omega):
+            self.found(f'{self._topic}: {twist or "invalid bytes"}; allowed: finite values')
+            return
+        passed = max(self.world_seconds - last.seconds, (self.world.now - last.now) / NANOSECONDS)
+        left_v = min(last.left_v + passed, self.slack)
+        left_omega = min(last.left_omega + passed, self.slack)
+        if not (self.stops and twist.is_zero):
+            left_v -= _duration(twist.v - last.twist.v, self.v)
+            left_omega -= _duration(twist.omega - last.twist.omega, self.omega)
+            if min(left_v, left_omega) < -MARGIN:
+                self.found(
+                    f'{self._topic}: {twist}, after {last.twist} {passed:g} s before; allowed: changes '
+                    f'of {self.v:g} m/s and {self.omega:g} rad/s per second, early by '
+                    f'{self.slack:g} s'
+                )
+        self._last[publisher] = _Last(twist, self.world_seconds, self.world.now, left_v, left_omega)
+        self.note(self._topic, ': ', twist)
 
 
 class _Last(NamedTuple):
@@ -125,35 +138,6 @@ class _Last(NamedTuple):
     left_omega: float
 
 
-class _AccelerationWatch(PropertyWatch[AccelerationWithin]):
-    def __init__(self, required: AccelerationWithin, world: Lockstep) -> None:
-        super().__init__(required, world)
-        self._start = _Last(Twist(0.0, 0.0), self.seconds, world.now, required.slack, required.slack)
-        self._last: dict[Publisher, _Last] = {}
-        self._topic = self.on_published(required.topic, self._on_message)
-
-    def _on_message(self, publisher: Publisher, message: Any) -> None:
-        limit, last = self.required, self._last.get(publisher, self._start)
-        twist = read_twist(publisher.msg_type, message)
-        if twist is None or not math.isfinite(twist.v + twist.omega):
-            self.found(f'{self._topic}: {twist or "invalid bytes"}; allowed: finite values')
-            return
-        passed = max(self.seconds - last.seconds, (self.world.now - last.now) / NANOSECONDS)
-        left_v = min(last.left_v + passed, limit.slack)
-        left_omega = min(last.left_omega + passed, limit.slack)
-        if not (limit.stops and twist.is_zero):
-            left_v -= _duration(twist.v - last.twist.v, limit.v)
-            left_omega -= _duration(twist.omega - last.twist.omega, limit.omega)
-            if min(left_v, left_omega) < -MARGIN:
-                self.found(
-                    f'{self._topic}: {twist}, after {last.twist} {passed:g} s before; allowed: changes '
-                    f'of {limit.v:g} m/s and {limit.omega:g} rad/s per second, early by '
-                    f'{limit.slack:g} s'
-                )
-        self._last[publisher] = _Last(twist, self.seconds, self.world.now, left_v, left_omega)
-        self.note(self._topic, ': ', twist)
-
-
 def _duration(change: float, rate: float) -> float:
     """Return how long a change takes at a rate of change (s)."""
     if change == 0.0:
@@ -164,30 +148,26 @@ def _duration(change: float, rate: float) -> float:
 # --- Places
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class PlaceProperty(MotionProperty):
     """A property of each message of the odometry. Base class."""
-
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _PlaceWatch(self, world)
 
     @abstractmethod
     def violation(self, pose: Pose, twist: Twist) -> str | None:
         """Return what is allowed, if a pose and a twist of the odometry are not; None: they are."""
 
-
-class _PlaceWatch(MotionWatch[PlaceProperty]):
     def on_motion(self, pose: Pose, twist: Twist) -> None:
-        if (allowed := self.required.violation(pose, twist)) is not None:
-            self.found(f'{self.odom}: {pose}, {twist}; allowed: {allowed}')
-        self.note(self.odom, ': ', pose, ', ', twist)
+        """Check a message of the odometry."""
+        if (allowed := self.violation(pose, twist)) is not None:
+            self.found(f'{self._odom}: {pose}, {twist}; allowed: {allowed}')
+        self.note(self._odom, ': ', pose, ', ', twist)
 
     def on_invalid(self) -> None:
-        self.found(f'{self.odom}: bytes that are no Odometry')
+        """Note bytes that are no odometry."""
+        self.found(f'{self._odom}: bytes that are no Odometry')
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class PoseFinite(PlaceProperty):
     """Pose and twist in the odometry are finite, and the position is below 1e6 m.
 
@@ -228,7 +208,7 @@ def _corners(name: str, value: Any) -> tuple[tuple[float, ...], ...]:
 Interval = Annotated[tuple[float, float], _interval]
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class StaysWithin(PlaceProperty):
     """The robot stays within a box. Each published message of the odometry counts.
 
@@ -248,7 +228,7 @@ class StaysWithin(PlaceProperty):
         return f'x from {left:g} m to {right:g} m, y from {low:g} m to {high:g} m'
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class StaysNear(PlaceProperty):
     """The robot stays near a path. Each published message of the odometry counts.
 
@@ -281,7 +261,10 @@ def _distance(x: float, y: float, start: tuple[float, float], end: tuple[float, 
 # --- Published paths
 
 
-@dataclass(frozen=True, repr=False)
+_read_path = field_reader(lambda _: PATH.fields)
+
+
+@dataclass(repr=False)
 class StaysOnPath(MotionProperty):
     """The robot stays on each path that is published, and reaches its end in time.
 
@@ -307,27 +290,19 @@ class StaysOnPath(MotionProperty):
     goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
     cancel: RosName = field(default='cancel_goal', kw_only=True)
 
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _PathWatch(self, world)
-
-
-_read_path = field_reader(lambda _: PATH.fields)
-
-
-class _PathWatch(MotionWatch[StaysOnPath]):
-    def __init__(self, required: StaysOnPath, world: Lockstep) -> None:
-        super().__init__(required, world)
+    def begin(self) -> None:
+        """Begin to observe the path and the robot."""
+        super().begin()
         self._progress: PathProgress | None = None
         self._since = 0.0
         self._reached = False
-        self._path = self.on_published(required.path, self._on_path)
-        for topic in required.goals:
-            world.on_published(required.resolved(topic), self._on_other)
-        world.on_response(required.resolved(required.cancel), self._on_other)
+        self._path = self.on_published(self.path, self._on_path, raw=True)
+        for topic in self.goals:
+            self.on_published(topic, self._on_other, optional=True, raw=True)
+        self.on_response(self.cancel, self._on_other)
 
     def _on_path(self, publisher: Publisher, message: Any) -> None:
-        self._progress, self._since, self._reached = None, self.seconds, False
+        self._progress, self._since, self._reached = None, self.world_seconds, False
         fields = _read_path(publisher.msg_type, message)
         try:
             if fields is not None:
@@ -342,42 +317,44 @@ class _PathWatch(MotionWatch[StaysOnPath]):
         self.note('the path is replaced or canceled')
 
     def on_motion(self, pose: Pose, _: Twist) -> None:
-        progress, required = self._progress, self.required
+        """Receive a message of the odometry."""
+        progress = self._progress
         if progress is None:
             return
         if not math.isfinite(sum(pose)):
-            self.found(f'{self.odom}: {pose}; allowed: finite values')
+            self.found(f'{self._odom}: {pose}; allowed: finite values')
             return
         progress.moved(pose)
-        if progress.s >= required.after and not abs(progress.across) <= required.tolerance + ROUNDING:
-            self.found(f'{self._where(progress)}; allowed: {required.tolerance:g} m from the path')
-        self._reached |= progress.remaining <= required.tolerance + ROUNDING
+        if progress.s >= self.after and not abs(progress.across) <= self.tolerance + ROUNDING:
+            self.found(f'{self._where(progress)}; allowed: {self.tolerance:g} m from the path')
+        self._reached |= progress.remaining <= self.tolerance + ROUNDING
         self.check()
-        self.note(self.odom, ': ', pose)
+        self.note(self._odom, ': ', pose)
 
     def _where(self, progress: PathProgress) -> str:
         if self.pose is None:
-            return f'there was no odometry on {self.odom}'
+            return f'there was no odometry on {self._odom}'
         return (
             f'the robot is {abs(progress.across):.6g} m from the path and {progress.s:.6g} m along its '
             f'{progress.path.length:.6g} m: {self.pose}'
         )
 
     def check(self) -> str | None:
-        required, late = self.required, self.seconds - self._since > self.required.within + ROUNDING
+        """Return what is violated; None: nothing."""
+        late = self.world_seconds - self._since > self.within + ROUNDING
         if self._progress is not None and late and not self._reached:
             self.found(
-                f'{required.within:g} s after the path was published {self._where(self._progress)}; '
-                f'allowed: within {required.tolerance:g} m of its end'
+                f'{self.within:g} s after the path was published {self._where(self._progress)}; '
+                f'allowed: within {self.tolerance:g} m of its end'
             )
         return super().check()
 
     def finish(self) -> str | None:
-        within = self.required.within
-        if self._progress is None or self._reached or math.isinf(within):
+        """Return what is violated at the end; None: nothing."""
+        if self._progress is None or self._reached or math.isinf(self.within):
             return None
         return self.described(
-            f'the run ended {self.seconds - self._since:g} s after the path was published, and '
-            f'{self._where(self._progress)}; allowed: within {self.required.tolerance:g} m of its end. '
-            f'Let it run for {within:g} s after the path'
+            f'the run ended {self.world_seconds - self._since:g} s after the path was published, and '
+            f'{self._where(self._progress)}; allowed: within {self.tolerance:g} m of its end. '
+            f'Let it run for {self.within:g} s after the path'
         )

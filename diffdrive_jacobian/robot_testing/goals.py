@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.faults.fault import RosName
-from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, PATH, POSE, STAMP, Status
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.goal_status import (
@@ -23,15 +22,10 @@ from diffdrive_jacobian.messages.goal_status import (
     Stamp,
 )
 from diffdrive_jacobian.numerics.checks import Names, NotNegative, PositiveOrInfinite
-from diffdrive_jacobian.properties._messages import Pose, Twist, field_reader, planar, read_twist
-from diffdrive_jacobian.properties.base import (
-    ROUNDING,
-    MotionProperty,
-    MotionWatch,
-    Property,
-    PropertyWatch,
-    Watch,
-)
+from diffdrive_jacobian.properties.base import ROUNDING, Property, end_of_faults
+from diffdrive_jacobian.properties.fields import field_reader
+from diffdrive_jacobian.robot_testing.odometry import MotionProperty
+from diffdrive_jacobian.robot_testing.readings import Pose, Twist, planar, read_twist
 
 ENDED_OTHERWISE = (GoalState.CANCELED, GoalState.ABORTED)
 """States of goals that the robot need not reach any longer."""
@@ -99,7 +93,7 @@ def _text(stamp: Stamp) -> str:
     return f'the goal with stamp {stamp[0]}.{stamp[1]:09d} s'
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class GoalProperty(MotionProperty):
     """A property of the way to goals. Base class.
 
@@ -114,13 +108,6 @@ class GoalProperty(MotionProperty):
     path: RosName = field(default='path', kw_only=True)
     cancel: RosName = field(default='cancel_goal', kw_only=True)
 
-
-G = TypeVar('G', bound=GoalProperty)
-
-
-class _GoalWatch(MotionWatch[G]):
-    """Observes the way to a goal."""
-
     @property
     def stands(self) -> bool:
         """Whether the robot stands still."""
@@ -129,32 +116,34 @@ class _GoalWatch(MotionWatch[G]):
     def where(self, goal: SentGoal, of: str = '') -> str:
         """Return where the robot is, relative to a goal `of` a controller."""
         if self.pose is None:
-            return f'there was no odometry on {self.odom}'
+            return f'there was no odometry on {self._odom}'
         distance = self.pose.distance(goal.pose)
         return (
             f'the robot is {distance:.6g} m from the goal{of} at {goal.pose}: {self.pose}, {self.twist}'
         )
 
 
-class _PublishedGoalWatch(_GoalWatch[G]):
-    """Observes the last goal that was published, while it is due."""
+@dataclass(repr=False)
+class PublishedGoalProperty(GoalProperty):
+    """A property of the last goal that was published. Base class."""
 
-    def __init__(self, required: G, world: Lockstep) -> None:
-        super().__init__(required, world)
+    def begin(self) -> None:
+        """Begin to observe the goals and the robot."""
+        super().begin()
         self.goal: SentGoal | None = None
-        world.expect(*map(required.resolved, required.goals))
-        for topic in required.goals:
-            world.on_published(required.resolved(topic), self._on_goal)
-        world.on_published(required.resolved(required.path), self._on_path)
-        world.on_response(required.resolved(required.cancel), self._on_cancel)
+        self.world.expect(*map(self.resolved, self.goals))
+        for topic in self.goals:
+            self.on_published(topic, self._on_goal, optional=True, raw=True)
+        self.on_published(self.path, self._on_path, optional=True, raw=True)
+        self.on_response(self.cancel, self._on_cancel)
 
     def _on_path(self, publisher: Publisher, message: Any) -> None:
-        if read_path(publisher.msg_type, message, self.seconds) is not None:
+        if read_path(publisher.msg_type, message, self.world_seconds) is not None:
             self.goal = None
             self.note('a path replaces the goal')
 
     def _on_goal(self, publisher: Publisher, message: Any) -> None:
-        self.goal = read_goal(publisher.msg_type, message, self.seconds)
+        self.goal = read_goal(publisher.msg_type, message, self.world_seconds)
         if self.goal is not None:
             self.note(f'{publisher.topic_name}: goal at {self.goal.pose}')
 
@@ -163,8 +152,8 @@ class _PublishedGoalWatch(_GoalWatch[G]):
         self.note('canceled')
 
 
-@dataclass(frozen=True, repr=False)
-class ReachesGoal(GoalProperty):
+@dataclass(repr=False)
+class ReachesGoal(PublishedGoalProperty):
     """The robot stands at each goal within a time after the goal was published.
 
     It stands at a goal when a message of its odometry has a pose within `tolerance` of the goal (and
@@ -182,50 +171,47 @@ class ReachesGoal(GoalProperty):
     tolerance: PositiveOrInfinite = field(default=0.05, kw_only=True)
     yaw_tolerance: PositiveOrInfinite = field(default=math.inf, kw_only=True)
 
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _ReachesWatch(self, world)
-
-
-class _ReachesWatch(_PublishedGoalWatch[ReachesGoal]):
     def on_motion(self, pose: Pose, twist: Twist) -> None:
-        required, goal = self.required, self.goal
+        """Receive a message of the odometry."""
+        goal = self.goal
         if (
             goal is not None
             and self.stands
-            and pose.distance(goal.pose) <= required.tolerance
-            and abs(math.remainder(pose.theta - goal.pose.theta, math.tau)) <= required.yaw_tolerance
+            and pose.distance(goal.pose) <= self.tolerance
+            and abs(math.remainder(pose.theta - goal.pose.theta, math.tau)) <= self.yaw_tolerance
         ):
-            passed = self.seconds - goal.seconds
-            if passed > required.within + ROUNDING:
+            passed = self.world_seconds - goal.seconds
+            if passed > self.within + ROUNDING:
                 self.found(
                     f'the robot stood at the goal {passed:g} s after it was published; allowed: '
-                    f'{required.within:g} s'
+                    f'{self.within:g} s'
                 )
             self.goal = None
 
     def check(self) -> str | None:
-        goal, required = self.goal, self.required
-        if goal is not None and (passed := self.seconds - goal.seconds) > required.within + ROUNDING:
+        """Return what is violated; None: nothing."""
+        goal = self.goal
+        if goal is not None and (passed := self.world_seconds - goal.seconds) > self.within + ROUNDING:
             self.found(
                 f'{passed:g} s after the goal was published {self.where(goal)}; allowed: '
-                f'within {required.tolerance:g} m and standing, within {required.within:g} s'
+                f'within {self.tolerance:g} m and standing, within {self.within:g} s'
             )
         return super().check()
 
     def finish(self) -> str | None:
-        goal, required = self.goal, self.required
+        """Return what is violated at the end; None: nothing."""
+        goal = self.goal
         if goal is None:
             return None
         return self.described(
-            f'the run ended {self.seconds - goal.seconds:g} s after the goal was published, and '
-            f'{self.where(goal)}; allowed: within {required.tolerance:g} m and standing. Let it run for '
-            f'{required.within:g} s after the goal'
+            f'the run ended {self.world_seconds - goal.seconds:g} s after the goal was published, and '
+            f'{self.where(goal)}; allowed: within {self.tolerance:g} m and standing. Let it run for '
+            f'{self.within:g} s after the goal'
         )
 
 
-@dataclass(frozen=True, repr=False)
-class Settles(GoalProperty):
+@dataclass(repr=False)
+class Settles(PublishedGoalProperty):
     """The robot is close to each goal after a settling time, and stays there.
 
     Later than `within` after a goal was published each pose of the odometry must be within `tolerance`
@@ -240,27 +226,23 @@ class Settles(GoalProperty):
     within: NotNegative
     tolerance: PositiveOrInfinite
 
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _SettlesWatch(self, world)
-
-
-class _SettlesWatch(_PublishedGoalWatch[Settles]):
     def on_motion(self, pose: Pose, twist: Twist) -> None:
-        goal, required = self.goal, self.required
-        if goal is None or self.seconds - goal.seconds <= required.within + ROUNDING:
+        """Receive a message of the odometry."""
+        goal = self.goal
+        if goal is None or self.world_seconds - goal.seconds <= self.within + ROUNDING:
             return
-        if not pose.distance(goal.pose) <= required.tolerance:
+        if not pose.distance(goal.pose) <= self.tolerance:
             self.found(
-                f'{self.seconds - goal.seconds:g} s after the goal was published {self.where(goal)}; '
-                f'allowed: {required.tolerance:g} m'
+                f'{self.world_seconds - goal.seconds:g} s after the goal was published '
+                f'{self.where(goal)}; allowed: {self.tolerance:g} m'
             )
 
     def finish(self) -> str | None:
-        goal, within = self.goal, self.required.within
+        """Return what is violated at the end; None: nothing."""
+        goal, within = self.goal, self.within
         if goal is None:
             return None
-        passed = self.seconds - goal.seconds
+        passed = self.world_seconds - goal.seconds
         if passed < within - ROUNDING or self.pose is None:
             return self.described(
                 f'the run ended {passed:g} s after the goal was published, and {self.where(goal)}. Let '
@@ -274,16 +256,7 @@ class _SettlesWatch(_PublishedGoalWatch[Settles]):
 # --- Arriving once the faults have ended
 
 
-def end_of_faults(world: Lockstep) -> float:
-    """Return the world time at which all faults have ended, and what they delayed has arrived (s).
-
-    Infinite: one of them has no end. Faults of one topic may delay a message one after the other.
-    """
-    end = max((fault.end for fault in world.faults), default=0.0)
-    return float(end + sum(fault.longest_delay for fault in world.faults))
-
-
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class DueGoalProperty(GoalProperty):
     """A property of the goals that a controller has received. Base class.
 
@@ -310,70 +283,27 @@ class DueGoalProperty(GoalProperty):
     status: RosName = field(default='goal_status', kw_only=True)
     commands: RosName = field(default='cmd_vel', kw_only=True)
 
-
-@dataclass(frozen=True, repr=False)
-class ArrivesOnceFaultsEnd(DueGoalProperty):
-    """The robot arrives at the goal that its controller has received, once the faults have ended.
-
-    A goal must not be due (`DueGoalProperty`) later than `within` after the controller has received it
-    and the last fault has ended. A run that ends before the goal is reached violates the property: let
-    it run longer.
-    """
-
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _ArrivesWatch(self, world)
-
-
-@dataclass(frozen=True, repr=False)
-class KeepsDriving(DueGoalProperty):
-    """The robot does not stand still on its way, once the faults have ended.
-
-    While a goal is due (`DueGoalProperty`) the robot must not stand for longer than `within`, beginning
-    when the controller has received the goal and the last fault has ended. It stands while the twists in
-    its odometry are at most 0.01 m/s and 0.05 rad/s.
-    """
-
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _KeepsDrivingWatch(self, world)
-
-
-class _Due(NamedTuple):
-    """A goal that is due."""
-
-    node: Node
-    """Its controller."""
-    goal: SentGoal
-    begin: float
-    """World time at which the time for it begins (s)."""
-    event: str
-    """What happened then."""
-    followed: FollowedGoal[SentGoal]
-    """The goal with its status."""
-
-
-class _DueGoalWatch(_GoalWatch[DueGoalProperty]):
-    def __init__(self, required: DueGoalProperty, world: Lockstep) -> None:
-        super().__init__(required, world)
+    def begin(self) -> None:
+        """Begin to observe the goals, the controllers and the robot."""
+        super().begin()
         self._followers: defaultdict[Node, GoalFollower[SentGoal]] = defaultdict(GoalFollower)
         self._received: dict[Node, FollowedGoal[SentGoal]] = {}
         self._reached: set[FollowedGoal[SentGoal]] = set()
-        self.moved = self.seconds
-        world.expect(*map(required.resolved, (*required.goals, required.path)))
-        for topic in required.goals:
-            world.on_delivered(required.resolved(topic), self._on_goal)
-        world.on_delivered(required.resolved(required.path), self._on_path)
-        self._commands = world.node.resolve_topic_name(required.resolved(required.commands))
-        world.expect(self._commands)
-        world.on_published(required.resolved(required.status), self._on_status)
-        world.on_response(required.resolved(required.cancel), self._on_cancel)
+        self._moved = self.world_seconds
+        self.world.expect(*map(self.resolved, (*self.goals, self.path)))
+        for topic in self.goals:
+            self.on_delivered(topic, self._on_goal, optional=True, raw=True)
+        self.on_delivered(self.path, self._on_path, optional=True, raw=True)
+        self._commands = self.world.node.resolve_topic_name(self.resolved(self.commands))
+        self.world.expect(self._commands)
+        self.on_published(self.status, self._on_status, optional=True, raw=True)
+        self.on_response(self.cancel, self._on_cancel)
 
     def _on_goal(self, node: Node, message_type: type, message: Any) -> None:
-        self._take(node, read_goal(message_type, message, self.seconds))
+        self._take(node, read_goal(message_type, message, self.world_seconds))
 
     def _on_path(self, node: Node, message_type: type, message: Any) -> None:
-        self._take(node, read_path(message_type, message, self.seconds))
+        self._take(node, read_path(message_type, message, self.world_seconds))
 
     def _take(self, node: Node, goal: SentGoal | None) -> None:
         if goal is None or not any(one.topic_name == self._commands for one in node.publishers):
@@ -391,11 +321,12 @@ class _DueGoalWatch(_GoalWatch[DueGoalProperty]):
             self._followers[node].reported(status.status, status.stamp)
 
     def on_motion(self, pose: Pose, _: Twist) -> None:
+        """Receive a message of the odometry."""
         if not self.stands:
-            self.moved = self.seconds
+            self._moved = self.world_seconds
             return
         for due in self.due():
-            if pose.distance(due.goal.pose) <= self.required.tolerance:
+            if pose.distance(due.goal.pose) <= self.tolerance:
                 # Steps of time may be long: this may be too late.
                 self.check()
                 self._reached.add(due.followed)
@@ -425,44 +356,77 @@ class _DueGoalWatch(_GoalWatch[DueGoalProperty]):
         return self.where(due.goal, f' of {self.name_of(due.node)}')
 
 
-class _ArrivesWatch(_DueGoalWatch):
+@dataclass(repr=False)
+class ArrivesOnceFaultsEnd(DueGoalProperty):
+    """The robot arrives at the goal that its controller has received, once the faults have ended.
+
+    A goal must not be due (`DueGoalProperty`) later than `within` after the controller has received it
+    and the last fault has ended. A run that ends before the goal is reached violates the property: let
+    it run longer.
+    """
+
     def check(self) -> str | None:
+        """Return what is violated; None: nothing."""
         for due in self.due():
-            passed = self.seconds - due.begin
-            if passed > self.required.within + ROUNDING:
+            passed = self.world_seconds - due.begin
+            if passed > self.within + ROUNDING:
                 self.found(
                     f'{passed:g} s after {due.event} {self.where_of(due)}; allowed: '
-                    f'within {self.required.tolerance:g} m and standing'
+                    f'within {self.tolerance:g} m and standing'
                 )
         return super().check()
 
     def finish(self) -> str | None:
+        """Return what is violated at the end; None: nothing."""
         for due in self.due():
             if math.isfinite(due.begin):
                 return self.described(
-                    f'the run ended {self.seconds - due.begin:g} s after {due.event}: '
-                    f'{self.where_of(due)}; allowed: within {self.required.tolerance:g} m and standing. '
-                    f'Let it run for {self.required.within:g} s after that'
+                    f'the run ended {self.world_seconds - due.begin:g} s after {due.event}: '
+                    f'{self.where_of(due)}; allowed: within {self.tolerance:g} m and standing. '
+                    f'Let it run for {self.within:g} s after that'
                 )
         return None
 
 
-class _KeepsDrivingWatch(_DueGoalWatch):
+@dataclass(repr=False)
+class KeepsDriving(DueGoalProperty):
+    """The robot does not stand still on its way, once the faults have ended.
+
+    While a goal is due (`DueGoalProperty`) the robot must not stand for longer than `within`, beginning
+    when the controller has received the goal and the last fault has ended. It stands while the twists in
+    its odometry are at most 0.01 m/s and 0.05 rad/s.
+    """
+
     def check(self) -> str | None:
+        """Return what is violated; None: nothing."""
         for due in self.due():
-            stood = self.seconds - max(due.begin, self.moved)
-            if stood > self.required.within + ROUNDING:
+            stood = self.world_seconds - max(due.begin, self._moved)
+            if stood > self.within + ROUNDING:
                 self.found(
-                    f'{self.seconds - due.begin:g} s after {due.event} the robot has stood for '
-                    f'{stood:g} s, and {self.where_of(due)}; allowed: {self.required.within:g} s'
+                    f'{self.world_seconds - due.begin:g} s after {due.event} the robot has stood for '
+                    f'{stood:g} s, and {self.where_of(due)}; allowed: {self.within:g} s'
                 )
         return super().check()
+
+
+class _Due(NamedTuple):
+    """A goal that is due."""
+
+    node: Node
+    """Its controller."""
+    goal: SentGoal
+    begin: float
+    """World time at which the time for it begins (s)."""
+    event: str
+    """What happened then."""
+    followed: FollowedGoal[SentGoal]
+    """The goal with its status."""
 
 
 # --- Canceling
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class NoCommandAfterCancel(Property):
     """A controller publishes no command that moves the robot after its cancel service has responded.
 
@@ -479,29 +443,23 @@ class NoCommandAfterCancel(Property):
     commands: RosName = field(default='cmd_vel', kw_only=True)
     goals: Names = field(default=('goal_pose', 'goals', 'path'), kw_only=True)
 
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _CancelWatch(self, world)
-
-
-class _CancelWatch(PropertyWatch[NoCommandAfterCancel]):
-    def __init__(self, required: NoCommandAfterCancel, world: Lockstep) -> None:
-        super().__init__(required, world)
+    def begin(self) -> None:
+        """Begin to observe commands, goals and the cancel service."""
         self._canceled: dict[Node, float] = {}
-        self._commands = self.on_published(required.commands, self._on_command)
-        for topic in required.goals:
-            world.on_delivered(required.resolved(topic), self._on_goal)
-        world.expect(required.resolved(required.cancel))
-        self._cancel = world.on_response(required.resolved(required.cancel), self._on_cancel)
+        self._commands = self.on_published(self.commands, self._on_command, raw=True)
+        for topic in self.goals:
+            self.on_delivered(topic, self._on_goal, optional=True, raw=True)
+        self.world.expect(self.resolved(self.cancel))
+        self._cancel = self.on_response(self.cancel, self._on_cancel)
 
     def _on_goal(self, node: Node, message_type: type, message: Any) -> None:
         read = read_path if message_type.__name__ == 'Path' else read_goal
-        if read(message_type, message, self.seconds) is not None:
+        if read(message_type, message, self.world_seconds) is not None:
             self._canceled.pop(node, None)
             self.note(f'{self.name_of(node)} received a goal')
 
     def _on_cancel(self, node: Node, _: Any) -> None:
-        self._canceled[node] = self.seconds
+        self._canceled[node] = self.world_seconds
         self.note(f'{self.name_of(node)} responded to {self._cancel}')
 
     def _on_command(self, publisher: Publisher, message: Any) -> None:
@@ -511,7 +469,7 @@ class _CancelWatch(PropertyWatch[NoCommandAfterCancel]):
             return
         if node in self._canceled and not twist.is_zero:
             self.found(
-                f'{self._commands}: {twist}, {self.seconds - self._canceled[node]:g} s after '
+                f'{self._commands}: {twist}, {self.world_seconds - self._canceled[node]:g} s after '
                 f'{self.name_of(node)} has responded to {self._cancel}; allowed: zero, '
                 'until it receives another goal'
             )
@@ -521,7 +479,7 @@ class _CancelWatch(PropertyWatch[NoCommandAfterCancel]):
 # --- Status
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class NoStaleGoals(Property):
     """A controller accepts no goal that is older than one that it has accepted, and none twice.
 
@@ -538,18 +496,12 @@ class NoStaleGoals(Property):
 
     topic: RosName = field(default='goal_status', kw_only=True)
 
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _StaleGoalWatch(self, world)
-
-
-class _StaleGoalWatch(PropertyWatch[NoStaleGoals]):
-    def __init__(self, required: NoStaleGoals, world: Lockstep) -> None:
-        super().__init__(required, world)
+    def begin(self) -> None:
+        """Begin to observe the status."""
         self._newest: dict[Publisher, tuple[Stamp, Any]] = {}
         """Stamp and identifier of the newest goal."""
-        self._clock = world.now
-        self._topic = self.on_published(required.topic, self._on_status)
+        self._clock = self.world.now
+        self._topic = self.on_published(self.topic, self._on_status, raw=True)
 
     def _on_status(self, publisher: Publisher, message: Any) -> None:
         status = read_status(publisher.msg_type, message)
@@ -570,13 +522,14 @@ class _StaleGoalWatch(PropertyWatch[NoStaleGoals]):
         self.note(f'{self._topic}: ACCEPTED of {_text(stamp)}')
 
     def check(self) -> str | None:
+        """Return what is violated; None: nothing."""
         if self.world.now < self._clock:
             self._newest.clear()
         self._clock = self.world.now
         return super().check()
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class StatusProtocol(Property):
     """The status of each goal goes its way: ACCEPTED, EXECUTING, then one terminal status, and no more.
 
@@ -600,33 +553,15 @@ class StatusProtocol(Property):
     topic: RosName = field(default='goal_status', kw_only=True)
     goals: Names = field(default=('goal_pose', 'goals', 'path'), kw_only=True)
 
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _StatusWatch(self, world)
-
-
-class _Goal(NamedTuple):
-    """A goal as one publisher names it."""
-
-    publisher: Publisher
-    uuid: bytes
-    stamp: Stamp
-
-    def __str__(self) -> str:
-        named = f' and identifier {self.uuid.hex()[:8]}...' if any(self.uuid) else ''
-        return _text(self.stamp) + named
-
-
-class _StatusWatch(PropertyWatch[StatusProtocol]):
-    def __init__(self, required: StatusProtocol, world: Lockstep) -> None:
-        super().__init__(required, world)
+    def begin(self) -> None:
+        """Begin to observe goals and their status."""
         self._last: dict[_Goal, GoalState] = {}
         self._active: dict[Publisher, _Goal] = {}
         self._received: Counter[tuple[Node, Stamp]] = Counter()
         self._answered: Counter[_Goal] = Counter()
-        self._topic = self.on_published(required.topic, self._on_status)
-        for goals in required.goals:
-            world.on_delivered(required.resolved(goals), self._on_goal)
+        self._topic = self.on_published(self.topic, self._on_status, raw=True)
+        for goals in self.goals:
+            self.on_delivered(goals, self._on_goal, optional=True, raw=True)
 
     def _on_goal(self, node: Node, message_type: type, message: Any) -> None:
         stamp = _read_stamp(message_type, message)
@@ -679,3 +614,15 @@ class _StatusWatch(PropertyWatch[StatusProtocol]):
         if not status.ended:
             self._active[goal.publisher] = goal
         self._last[goal] = status
+
+
+class _Goal(NamedTuple):
+    """A goal as one publisher names it."""
+
+    publisher: Publisher
+    uuid: bytes
+    stamp: Stamp
+
+    def __str__(self) -> str:
+        named = f' and identifier {self.uuid.hex()[:8]}...' if any(self.uuid) else ''
+        return _text(self.stamp) + named

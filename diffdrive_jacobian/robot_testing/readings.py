@@ -1,19 +1,14 @@
-"""The numbers of messages, however these were published."""
+"""Poses and twists in messages."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import suppress
-from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
-from rclpy.serialization import deserialize_message
-
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 from diffdrive_jacobian.messages.codecs import POSE_IN, TWIST_IN, pose_fields, twist_fields
-from diffdrive_jacobian.messages.structure import field_value, structure
+from diffdrive_jacobian.messages.structure import structure
+from diffdrive_jacobian.properties.fields import field_reader
 
 
 class Pose(NamedTuple):
@@ -24,6 +19,7 @@ class Pose(NamedTuple):
     theta: float
 
     def __str__(self) -> str:
+        """Return the values with their units."""
         return f'x {self.x:.6g} m, y {self.y:.6g} m, theta {self.theta:.6g} rad'
 
     def distance(self, other: Pose) -> float:
@@ -38,6 +34,7 @@ class Twist(NamedTuple):
     omega: float
 
     def __str__(self) -> str:
+        """Return the values with their units."""
         return f'v {self.v:.6g} m/s, omega {self.omega:.6g} rad/s'
 
     @property
@@ -48,40 +45,6 @@ class Twist(NamedTuple):
     def is_within(self, v: float, omega: float) -> bool:
         """Whether neither is larger than a limit. NaN is not."""
         return abs(self.v) <= v and abs(self.omega) <= omega
-
-
-Read = Callable[[type, Any], tuple[Any, ...] | None]
-
-
-def field_reader(fields_of: Callable[[type], tuple[str, ...]]) -> Read:
-    """Return a function that reads fields of a message, from its type and its object or its bytes.
-
-    It returns None if the bytes are not a message of the type.
-
-    Args:
-        fields_of: Returns the paths of the fields of a type of messages.
-    """
-
-    @cache
-    def compiled(message_type: type) -> tuple[tuple[str, ...], Reader]:
-        fields = fields_of(message_type)
-        return fields, Reader(message_type, fields, deserialize=deserialize_message)
-
-    # Several properties read the same message one after the other.
-    @lru_cache(1)
-    def read_bytes(message_type: type, message: bytes) -> tuple[Any, ...] | None:
-        with suppress(DecodingError):
-            fields: tuple[Any, ...] = compiled(message_type)[1](message)
-            return fields
-        return None
-
-    def read(message_type: type, message: Any) -> tuple[Any, ...] | None:
-        fields, _ = compiled(message_type)
-        if isinstance(message, bytes):
-            return read_bytes(message_type, message)
-        return tuple(field_value(message, field) for field in fields)
-
-    return read
 
 
 _read_twist = field_reader(lambda kind: twist_fields(_known(kind, TWIST_IN, 'twist')))

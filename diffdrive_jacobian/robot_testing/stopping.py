@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -12,19 +12,13 @@ from rclpy.publisher import Publisher
 from diffdrive_jacobian.faults.fault import RosName
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.numerics.checks import NotNegative
-from diffdrive_jacobian.properties._messages import Twist, read_twist
-from diffdrive_jacobian.properties.base import (
-    ROUNDING,
-    MotionProperty,
-    Property,
-    PropertyWatch,
-    Watch,
-)
+from diffdrive_jacobian.properties.base import ROUNDING, Property
+from diffdrive_jacobian.robot_testing.readings import Twist, read_twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 
-@dataclass(frozen=True, repr=False)
-class ReactionProperty(MotionProperty):
+@dataclass(repr=False)
+class ReactionProperty(Property):
     """A property of a node that does not receive messages any more. Base class.
 
     The time is what a timer of the node can measure. It does not pass while the clock of the nodes
@@ -35,46 +29,41 @@ class ReactionProperty(MotionProperty):
         within: Longest time (s).
         node: Name of the node (default: all).
         commands: Topic of the commands (default: 'cmd_vel').
+        odom: Topic of type Odometry (default: 'odom').
     """
 
+    odom: RosName = field(default='odom', kw_only=True)
     within: NotNegative
     node: str = field(default='', kw_only=True)
     commands: RosName = field(default='cmd_vel', kw_only=True)
 
-
-R = TypeVar('R', bound=ReactionProperty)
-
-
-class _ReactionWatch(PropertyWatch[R]):
-    """Measures the time since nodes have received a message."""
-
-    def __init__(self, required: R, world: Lockstep) -> None:
-        super().__init__(required, world)
-        self._world_time, self._clock = world.world_time, world.now
+    def begin(self) -> None:
+        """Begin to measure the time since nodes have received a message."""
+        self._world_time, self._clock = self.world.world_time, self.world.now
         self._passed, self._jumped = 0, -math.inf
         self._received: dict[Node, tuple[float, float]] = {}
 
     def check(self) -> str | None:
+        """Return what is violated; None: nothing."""
         # Where the clock jumps is noticed only when it is read.
         self._time()
         return super().check()
 
     def received(self, node: Node) -> None:
         """Note that a node has received a message."""
-        self._received[node] = self._time(), self.seconds
+        self._received[node] = self._time(), self.world_seconds
 
     def late(self, node: Node, topic: str, subject: str = '') -> str | None:
         """Return that a node, the `subject`, has received a topic too long ago; None: it has not."""
-        begin, seconds = self._received.setdefault(node, (self._time(), self.seconds))
+        begin, seconds = self._received.setdefault(node, (self._time(), self.world_seconds))
         passed = self._time() - max(begin, self._jumped)
-        within = self.required.within
-        if passed <= within + ROUNDING or node not in self.world.nodes:
+        if passed <= self.within + ROUNDING or node not in self.world.nodes:
             return None
         name = self.name_of(node)
         subscribed = any(one.topic_name == topic for one in node.subscriptions)
-        if not subscribed or not is_named(name, self.required.node):
+        if not subscribed or not is_named(name, self.node):
             return None
-        allowed = within + delays(self.world, node, seconds)
+        allowed = self.within + delays(self.world, node, seconds)
         if passed <= allowed + ROUNDING:
             return None
         return (
@@ -103,7 +92,7 @@ class _ReactionWatch(PropertyWatch[R]):
 
 def delays(world: Lockstep, node: Node, since: float) -> float:
     """Return by how much faults of a node may have delayed its reaction since a world time (s)."""
-    name, now = node.get_fully_qualified_name(), world.world_time / NANOSECONDS
+    name, now = node.get_fully_qualified_name(), world.world_seconds
     total = 0.0
     for fault in world.faults:
         if fault.affected_node and is_named(name, fault.affected_node):
@@ -116,7 +105,7 @@ def is_named(name: str, wanted: str) -> bool:
     return not wanted or name.lstrip('/') == wanted.lstrip('/')
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class StopsAfterLostOdometry(ReactionProperty):
     """A controller stops the robot within a time after it has received its last odometry.
 
@@ -127,17 +116,12 @@ class StopsAfterLostOdometry(ReactionProperty):
     removed or killed cannot stop anything, and are not checked. The time: see `ReactionProperty`.
     """
 
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _LostOdometryWatch(self, world)
-
-
-class _LostOdometryWatch(_ReactionWatch[StopsAfterLostOdometry]):
-    def __init__(self, required: StopsAfterLostOdometry, world: Lockstep) -> None:
-        super().__init__(required, world)
+    def begin(self) -> None:
+        """Begin to observe commands and odometry."""
+        super().begin()
         self._moving: dict[Node, Twist] = {}
-        self._commands = self.on_published(required.commands, self._on_command)
-        self._odom = self.on_delivered(required.odom, self._on_odometry)
+        self._commands = self.on_published(self.commands, self._on_command, raw=True)
+        self._odom = self.on_delivered(self.odom, self._on_odometry, raw=True)
 
     def _on_odometry(self, node: Node, _: type, __: Any) -> None:
         if node in self._moving:
@@ -160,6 +144,7 @@ class _LostOdometryWatch(_ReactionWatch[StopsAfterLostOdometry]):
         self.note(self._commands, ': ', twist)
 
     def check(self) -> str | None:
+        """Return what is violated; None: nothing."""
         for node in self._moving:
             self._check(node)
         return super().check()
@@ -169,7 +154,7 @@ class _LostOdometryWatch(_ReactionWatch[StopsAfterLostOdometry]):
             self.found(f'the last command of {self.name_of(node)} is {self._moving[node]}, {late}')
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class StopsAfterLastCommand(ReactionProperty):
     """A robot stands still when it has not received a command for a time.
 
@@ -185,16 +170,11 @@ class StopsAfterLastCommand(ReactionProperty):
     v: NotNegative = field(default=0.001, kw_only=True)
     omega: NotNegative = field(default=0.001, kw_only=True)
 
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _LastCommandWatch(self, world)
-
-
-class _LastCommandWatch(_ReactionWatch[StopsAfterLastCommand]):
-    def __init__(self, required: StopsAfterLastCommand, world: Lockstep) -> None:
-        super().__init__(required, world)
-        self._odom = self.on_published(required.odom, self._on_odometry)
-        self._commands = self.on_delivered(required.commands, self._on_command)
+    def begin(self) -> None:
+        """Begin to observe odometry and commands."""
+        super().begin()
+        self._odom = self.on_published(self.odom, self._on_odometry, raw=True)
+        self._commands = self.on_delivered(self.commands, self._on_command, raw=True)
 
     def _on_command(self, node: Node, _: type, __: Any) -> None:
         self.received(node)
@@ -202,14 +182,14 @@ class _LastCommandWatch(_ReactionWatch[StopsAfterLastCommand]):
 
     def _on_odometry(self, publisher: Publisher, message: Any) -> None:
         twist = read_twist(publisher.msg_type, message)
-        if twist is None or twist.is_within(self.required.v, self.required.omega):
+        if twist is None or twist.is_within(self.v, self.omega):
             return
         node = self.owner(publisher)
         if node is not None and (late := self.late(node, self._commands)) is not None:
             self.found(f'{self._odom}: {twist}, {late}')
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class StopsOnShutdown(Property):
     """A node that is shut down leaves with a command of zero.
 
@@ -225,26 +205,21 @@ class StopsOnShutdown(Property):
     node: str = field(default='', kw_only=True)
     commands: RosName = field(default='cmd_vel', kw_only=True)
 
-    def watch(self, world: Lockstep) -> Watch:
-        """Begin to observe a run."""
-        return _ShutdownWatch(self, world)
-
-
-class _ShutdownWatch(PropertyWatch[StopsOnShutdown]):
-    def __init__(self, required: StopsOnShutdown, world: Lockstep) -> None:
-        super().__init__(required, world)
+    def begin(self) -> None:
+        """Begin to observe commands."""
         self._last: dict[Node, Twist] = {}
-        self._commands = self.on_published(required.commands, self._on_command)
+        self._commands = self.on_published(self.commands, self._on_command, raw=True)
 
     def _on_command(self, publisher: Publisher, message: Any) -> None:
         node, twist = self.owner(publisher), read_twist(publisher.msg_type, message)
         if node is None or twist is None or node is self.world.node:
             return
-        if is_named(self.name_of(node), self.required.node):
+        if is_named(self.name_of(node), self.node):
             self._last[node] = twist
         self.note(self._commands, ': ', twist)
 
     def check(self) -> str | None:
+        """Return what is violated; None: nothing."""
         gone = self._last.keys() - self.world.nodes
         for node in [one for one in self._last if one in gone]:
             twist = self._last.pop(node)
@@ -256,4 +231,5 @@ class _ShutdownWatch(PropertyWatch[StopsOnShutdown]):
         return super().check()
 
     def finish(self) -> str | None:
+        """Return what is violated at the end."""
         return self.check()

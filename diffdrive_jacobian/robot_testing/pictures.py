@@ -1,0 +1,21 @@
+"""The picture of a run of a robot, for failed tests and findings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from diffdrive_jacobian.bags import BagError, read_run
+from diffdrive_jacobian.plots.run_figure import ViolationMark, draw
+
+
+def draw_run(bag: Path, picture: Path, marks: Sequence[tuple[int, str]]) -> str | None:
+    """Draw a bag with odometry. Return why not; '': it is drawn, None: it has no odometry."""
+    try:
+        run = read_run(bag)
+        if not len(run.odometry.values):
+            return None
+        draw([run], picture, violations=[ViolationMark(*mark) for mark in marks])
+    except (BagError, ModuleNotFoundError, OSError) as error:
+        return str(error)
+    return ''

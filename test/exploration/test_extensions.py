@@ -1,0 +1,155 @@
+"""What other distributions add by entry points: kinds of faults, and pictures."""
+
+from __future__ import annotations
+
+import sys
+from textwrap import dedent
+
+import pytest
+from hypothesis import find
+from hypothesis import strategies as st
+from rclpy.node import Node
+
+from diffdrive_jacobian.exploration import extensions
+from diffdrive_jacobian.exploration.scenario import ExplorationError
+from diffdrive_jacobian.faults import DeadWheel, Hang
+from diffdrive_jacobian.testing import RecordedRun, fault_schedules
+
+ARM = """
+    from dataclasses import dataclass, field
+    from hypothesis import strategies as st
+    from diffdrive_jacobian.faults import Fault
+
+    @dataclass(frozen=True, repr=False)
+    class JointStuck(Fault):
+        joint: int
+        arm: str = field(default='arm', kw_only=True)
+
+        def install(self, injection):
+            injection.during(lambda: None)
+
+    KINDS = {JointStuck: lambda: {'joint': st.integers(0, 2)}}
+
+    EMPTY = None
+    WRONG = {int: dict}
+
+    def fail(*_):
+        raise ValueError('no arm')
+
+    def draw(bag, picture, marks):
+        if 'arm' not in bag.name:
+            return None
+        if 'broken' in bag.name:
+            return 'it is broken'
+        picture.write_text(str(marks))
+        return ''
+"""
+
+
+@pytest.fixture
+def distribution(tmp_path, monkeypatch):
+    """Return a function that installs a distribution with a module `arm_testing` and entry points."""
+
+    def install(**entry_points):
+        (tmp_path / 'arm_testing.py').write_text(dedent(ARM))
+        info = tmp_path / 'arm_testing-1.0.dist-info'
+        info.mkdir()
+        (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: arm-testing\nVersion: 1.0\n')
+        lines = [
+            f'[diffdrive_jacobian.{group}]\n{line}\n'
+            for group, lines in entry_points.items()
+            for line in lines
+        ]
+        (info / 'entry_points.txt').write_text('\n'.join(lines))
+
+    monkeypatch.syspath_prepend(tmp_path)
+    yield install
+    sys.modules.pop('arm_testing', None)
+
+
+def test_another_distribution_has_kinds_of_faults_of_its_own(distribution):
+    distribution(fault_kinds=['arm = arm_testing:KINDS'])
+    strategy = fault_schedules(arms=['left', 'right'], nodes=['driver'], duration=2.0)
+    (stuck,) = find(strategy, lambda faults: any(hasattr(one, 'joint') for one in faults))
+    assert repr(stuck) == "JointStuck(0, duration=0.1, arm='left')"
+    assert find(strategy, lambda faults: any(isinstance(one, Hang) for one in faults))
+    # By its class, too.
+    with pytest.raises(ValueError, match=r'^JointStuck needs arms$'):
+        fault_schedules(nodes=['driver'], kinds=[type(stuck)])
+    kinds = [type(stuck), st.just(Hang('driver'))]
+    assert find(fault_schedules(arms=['left'], kinds=kinds), lambda faults: Hang('driver') in faults)
+
+
+def test_names_that_no_distribution_has_faults_for_are_refused():
+    for arguments, words in (
+        ({'robot': ['a']}, r"no argument 'robot', .*; there are topics, nodes, services, robots$"),
+        ({'arms': ['a']}, r"no argument 'arms', and no installed distribution has faults for it"),
+        ({}, 'fault_schedules needs topics, nodes, services, robots, fields or kinds'),
+        ({'robots': 'robot'}, 'robots must be a list or tuple of names'),
+    ):
+        with pytest.raises(ValueError, match=words):
+            fault_schedules(**arguments)
+
+
+@pytest.mark.parametrize(
+    ('value', 'words'),
+    [
+        ('arm_testing:JointStuck', r'arm of .*fault_kinds must be a dict of classes of faults'),
+        ('arm_testing:EMPTY', r'must be a dict of classes'),
+        ('arm_testing:WRONG', r'must be a dict of classes'),
+        ('arm_ends', r'arm = arm_ends of .* cannot be imported: SystemExit: 3'),
+        ('arm_fails', r'arm = arm_fails of .* cannot be imported: ZeroDivisionError'),
+    ],
+)
+def test_kinds_of_faults_that_are_none_are_named(distribution, tmp_path, value, words):
+    (tmp_path / 'arm_ends.py').write_text('raise SystemExit(3)')
+    (tmp_path / 'arm_fails.py').write_text('1 / 0')
+    distribution(fault_kinds=[f'arm = {value}'])
+    with pytest.raises(ExplorationError, match=words):
+        fault_schedules(arms=['arm'])
+    # Another error is not hidden by that.
+    with pytest.raises(ValueError, match=r'^DeadWheel needs robots$'):
+        fault_schedules(nodes=['driver'], kinds=[DeadWheel])
+
+
+def test_two_entry_points_of_one_name_are_refused(distribution, tmp_path, monkeypatch):
+    distribution(fault_kinds=['arm = arm_testing:KINDS'])
+    other = tmp_path / 'other'
+    info = other / 'other-1.0.dist-info'
+    info.mkdir(parents=True)
+    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: other\nVersion: 1.0\n')
+    (info / 'entry_points.txt').write_text('[diffdrive_jacobian.fault_kinds]\narm = other:KINDS\n')
+    monkeypatch.syspath_prepend(other)
+    words = 'several distributions have an entry point arm of .*: arm_testing:KINDS, other:KINDS'
+    with pytest.raises(ExplorationError, match=words):
+        fault_schedules(arms=['arm'])
+
+
+def test_a_picture_that_fails_loses_no_bag_and_hides_no_other(distribution, tmp_path, lockstep):
+    distribution(pictures=['arm = arm_testing:fail', 'leg = arm_testing:fail'])
+    lockstep.create(lambda: Node('arm'))
+    run = RecordedRun(lockstep, tmp_path / 'kept')
+    kept = run.keep()
+    run.close()
+    assert (tmp_path / 'kept' / 'run' / 'metadata.yaml').exists()
+    words = 'not drawn: arm of diffdrive_jacobian.pictures: ValueError: no arm; leg of'
+    assert kept.startswith(f'{run.bag}\n{words}')
+
+
+def test_an_entry_point_that_cannot_be_imported_is_named(distribution, tmp_path):
+    distribution(fault_kinds=['arm = arm_testing:NOTHING'], pictures=['arm = no_such_module:draw'])
+    words = r'entry point arm = arm_testing:NOTHING of diffdrive_jacobian.fault_kinds cannot be imported'
+    with pytest.raises(ExplorationError, match=words):
+        fault_schedules(arms=['arm'])
+    why = extensions.draw(tmp_path / 'bag', tmp_path / 'picture')
+    assert 'arm = no_such_module:draw of diffdrive_jacobian.pictures cannot be imported' in why
+
+
+def test_a_bag_is_drawn_by_whoever_knows_it(distribution, tmp_path):
+    distribution(pictures=['arm = arm_testing:draw'])
+    picture = tmp_path / 'picture'
+    assert extensions.draw(tmp_path / 'bag_of_arm', picture, [(1, 'violated')]) == ''
+    assert picture.read_text() == "[(1, 'violated')]"
+    # The picture of a robot is tried next.
+    assert extensions.draw(tmp_path / 'broken_arm', picture).startswith('it is broken; there is no bag')
+    assert 'no bag' in extensions.draw(tmp_path / 'nothing', picture)
