@@ -429,9 +429,9 @@ def _constant_docstring(value: object, path: str) -> str:
     """Return the string below the assignment of a constant."""
     if description := getattr(value, 'description', ''):
         return str(description)
-    package, name = path.split('.')[0], path.split('.')[-1]
+    name = path.split('.')[-1]
     for key, module in list(sys.modules.items()):
-        if key.startswith(f'{diffdrive_jacobian.__name__}.{package}') and name in vars(module):
+        if key.startswith(f'{diffdrive_jacobian.__name__}.') and name in vars(module):
             for statement, below in itertools.pairwise(ast.parse(inspect.getsource(module)).body):
                 target = statement.targets[0] if isinstance(statement, ast.Assign) else None
                 if (

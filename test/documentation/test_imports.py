@@ -23,7 +23,7 @@ LAYERS = (
     *('messages', 'parameters', 'bags', 'calibration', 'plots'),
     *('ros', 'nodes', 'diagnosis', 'recording', 'lockstep', 'faults', 'properties'),
     *('exploration', 'drives'),
-    *('live', 'testing', 'tools'),
+    *('testing', 'robot_testing', 'live', 'tools'),
 )
 PURE = LAYERS[:4]
 # These may load rosbags and what it needs, but nothing of ROS, and matplotlib only when they draw.
@@ -32,6 +32,7 @@ WITHOUT_ROS = LAYERS[4:9]
 COMMON = {
     **dict.fromkeys(('text', 'time_units', 'errors', 'lazy', 'safe_yaml', 'signals', 'locks'), ()),
 }
+TYPES = 'TYPE_CHECKING'
 LOUD = re.compile(r'\bprint\b|\bstdout\b|\bstderr\b')
 
 
@@ -48,6 +49,9 @@ def imports(path) -> set[str]:
     pending = [ast.parse(path.read_text(encoding='utf-8'))]
     while pending:
         node = pending.pop()
+        if path.name == '__init__.py' and isinstance(node, ast.If) and TYPES in ast.unparse(node.test):
+            # Names that are imported on first use, wherever they are.
+            continue
         # Statements only.
         for field in ('body', 'orelse', 'handlers', 'finalbody', 'cases'):
             pending += getattr(node, field, ())

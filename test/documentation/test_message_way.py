@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
+from std_msgs.msg import String
 
 import diffdrive_jacobian
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -17,10 +19,10 @@ PACKAGE = Path(diffdrive_jacobian.__file__).parent
 LINE = re.compile(r'( *)(\w+/\w+\.py) +([\w.]+)')
 
 
-def listed():
-    """Return level, file and function of each line of the page."""
+def listed(what='way'):
+    """Return level, file and function of each line of a list of the page."""
     (block,) = re.findall(
-        r'<!-- way -->\n```text\n(.*?)```', PAGE.read_text(encoding='utf-8'), re.DOTALL
+        rf'<!-- {what} -->\n```text\n(.*?)```', PAGE.read_text(encoding='utf-8'), re.DOTALL
     )
     lines = [LINE.match(line) for line in block.splitlines()]
     assert all(lines)
@@ -70,3 +72,28 @@ def test_an_odometry_takes_the_way_that_the_page_lists(lockstep):
         if above[0] in functions
     ]
     assert taken == page, 'the way in doc/design.md is not that of a message'
+
+
+class Talker(Node):
+    def __init__(self):
+        super().__init__('talker')
+        self.publisher = self.create_publisher(String, 'chatter', 10)
+        self.create_timer(0.1, lambda: self.publisher.publish(String()))
+
+
+def test_a_message_between_any_two_nodes_passes_few_functions(lockstep):
+    """Those that the page lists: they end when the other node has processed it, or lead to it."""
+    lockstep.add(Talker())
+    listener = lockstep.add(Node('listener'))
+    heard = []
+    listener.create_subscription(String, 'chatter', heard.append, 10)
+    lockstep.run_for(0.95)
+    calls = calls_during(lambda: lockstep.run_for(0.1))
+    ours = [call[0] for call in calls if call[0][0]]
+    (begin,) = [index for index, one in enumerate(ours) if one[1].endswith('send')]
+    (end,) = [index for index, one in enumerate(ours) if one[1].endswith('receive')]
+    page = [(file, name) for _, file, name in listed('way in lockstep')]
+    if not hasattr(calls_during.__code__, 'co_qualname'):
+        page = [(file, name.split('.')[-1]) for file, name in page]
+    assert ours[begin : end + 1] == page
+    assert len(page) <= 10
