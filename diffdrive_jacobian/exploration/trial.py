@@ -127,14 +127,14 @@ class _Collecting:
         self._world, self._watch = world, self._watched.watch(world)
         return self
 
-    def check(self) -> str | None:
+    def violated_now(self) -> str | None:
         if self._watch is None:
             return None
         self.checks += 1
-        return self._collected(answer(self._watch.check))
+        return self._collected(answer(self._watch.violated_now))
 
-    def finish(self) -> str | None:
-        return None if self._watch is None else self._collected(answer(self._watch.finish))
+    def violated_at_end(self) -> str | None:
+        return None if self._watch is None else self._collected(answer(self._watch.violated_at_end))
 
     def _collected(self, text: str | None) -> str | None:
         if text is None:
@@ -212,7 +212,6 @@ def _finish(world: Lockstep) -> tuple[str, ...]:
     """Check the properties at the end; return what faults and properties needed and did not find."""
     try:
         world.finish()
-        world.check_faults()
     except PropertyViolation:
         raise
     except IneffectiveFaultsError as error:

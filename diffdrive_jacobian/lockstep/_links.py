@@ -39,7 +39,7 @@ from diffdrive_jacobian.ros.rclpy_internals import (
 __tracebackhide__ = True
 
 StageOf = Callable[[Link], Stage | None]
-"""Returns the stage of a fault in a link; None: the fault does not affect it."""
+"""Returns the stage of a fault, or of a process, in a link; None: it does not affect it."""
 
 
 class SentElsewhere(NamedTuple):

@@ -25,10 +25,10 @@ __tracebackhide__ = True
 class Watch(Protocol):
     """What observes one run for a property."""
 
-    def check(self) -> str | None:
+    def violated_now(self) -> str | None:
         """Return what is violated at the current time, after all callbacks; None: nothing."""
 
-    def finish(self) -> str | None:
+    def violated_at_end(self) -> str | None:
         """Return what is violated at the end of the run; None: nothing."""
 
 
@@ -54,7 +54,7 @@ class _Required(NamedTuple):
 
 
 def answer(question: Callable[[], str | None]) -> str | None:
-    """Return what `check` or `finish` of a property returns. That it raises something violates it."""
+    """Return what a property answers. That it raises something violates it."""
     try:
         return question()
     except LockstepError:
@@ -111,7 +111,7 @@ class Properties:
     def check(self) -> None:
         """Check what is required at the current time, when all callbacks have been executed."""
         for required in self.required:
-            if (text := answer(required.watch.check)) is not None:
+            if (text := answer(required.watch.violated_now)) is not None:
                 self.required.remove(required)
                 required.end()
                 raise self._violation(required.property, text)
@@ -132,7 +132,7 @@ class Properties:
         for one in required:
             one.end()
         for one in required:
-            if (text := answer(one.watch.finish)) is not None:
+            if (text := answer(one.watch.violated_at_end)) is not None:
                 raise self._violation(one.property, text)
 
     def _violation(self, violated: Property, text: str) -> PropertyViolation:

@@ -77,12 +77,27 @@ class Property(Expression, ABC):
         """Begin to observe `self.world`, with `on_published` and so on."""
 
     def check(self) -> str | None:
-        """Return what is violated at the current time, after all callbacks; None: nothing."""
-        return self._found
+        """Return what is violated at the current time, after all callbacks; None: nothing.
+
+        It is asked where time stops: at timers, and where faults begin, end or let a message arrive.
+        """
+        return None
 
     def finish(self) -> str | None:
         """Return what is violated at the end of the run; None: nothing."""
         return None
+
+    # --- What `Lockstep` asks
+
+    def violated_now(self) -> str | None:
+        """Return what was found, or what `check` returns."""
+        text = None if self._found else self.check()
+        return self._found or text
+
+    def violated_at_end(self) -> str | None:
+        """Return what was found, or what `finish` returns."""
+        text = None if self._found else self.finish()
+        return self._found or text
 
     # --- Observing
 
@@ -114,7 +129,10 @@ class Property(Expression, ABC):
             if (decoded := self._decoded(publisher.msg_type, message, topic)) is not None:
                 self._call(observe, publisher, decoded)
 
-        return self.world.on_published(self.resolved(topic), observe if raw else observe_decoded)
+        def observe_raw(publisher: Publisher, message: Any) -> None:
+            self._call(observe, publisher, message)
+
+        return self.world.on_published(self.resolved(topic), observe_raw if raw else observe_decoded)
 
     def on_delivered(
         self,
@@ -136,7 +154,10 @@ class Property(Expression, ABC):
             if (decoded := self._decoded(message_type, message, topic)) is not None:
                 self._call(observe, node, message_type, decoded)
 
-        return self.world.on_delivered(self.resolved(topic), observe if raw else observe_decoded)
+        def observe_raw(node: Node, message_type: Any, message: Any) -> None:
+            self._call(observe, node, message_type, message)
+
+        return self.world.on_delivered(self.resolved(topic), observe_raw if raw else observe_decoded)
 
     def _decoded(self, message_type: Any, message: Any, topic: str) -> Any:
         """Return a message that may be serialized. None: it is invalid, which is a violation."""
@@ -148,8 +169,15 @@ class Property(Expression, ABC):
             self.found(f'{self.resolved(topic)}: bytes that are no {message_type.__name__}')
             return None
 
-    def on_response(self, service: str, observe: Callable[[Node, Any], None]) -> str:
-        """Call a function with the node and each response of a service. Return its full name."""
+    def on_response(
+        self, service: str, observe: Callable[[Node, Any], None], *, optional: bool = False
+    ) -> str:
+        """Call a function with the node and each response of a service. Return its full name.
+
+        It is an error if no node ever has the service, unless it is `optional`.
+        """
+        if not optional:
+            self.world.expect(self.resolved(service))
 
         def observe_safely(node: Node, response: Any) -> None:
             self._call(observe, node, response)
@@ -201,7 +229,7 @@ class Property(Expression, ABC):
         self._recent.append((self.world.world_time, parts))
 
     def found(self, text: str) -> None:
-        """Note a violation, which `check` will return. Only the first one counts."""
+        """Note a violation, which is raised when all callbacks are done. Only the first one counts."""
         if self._found is None:
             self._found = self.described(text)
 

@@ -6,6 +6,7 @@ import re
 import sys
 from pathlib import Path
 
+import pytest
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -16,7 +17,7 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 
 PAGE = Path(__file__).parents[2] / 'doc' / 'design.md'
 PACKAGE = Path(diffdrive_jacobian.__file__).parent
-LINE = re.compile(r'( *)(\w+/\w+\.py) +([\w.]+)')
+LINE = re.compile(r'( *)([\w/]+\.py) +([\w.]+)')
 
 
 def listed(what='way'):
@@ -97,3 +98,34 @@ def test_a_message_between_any_two_nodes_passes_few_functions(lockstep):
         page = [(file, name.split('.')[-1]) for file, name in page]
     assert ours[begin : end + 1] == page
     assert len(page) <= 10
+
+
+ECHO = """
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import String
+
+rclpy.init()
+node = Node('echo')
+publisher = node.create_publisher(String, 'answer', 10)
+node.create_subscription(String, 'chatter', publisher.publish, 10)
+rclpy.spin(node)
+"""
+
+
+@pytest.mark.process
+def test_a_message_to_a_process_takes_the_way_that_the_page_lists(lockstep, tmp_path):
+    program = tmp_path / 'echo.py'
+    program.write_text(ECHO)
+    lockstep.start([sys.executable, str(program)])
+    lockstep.publish('chatter', String(data='first'))
+    calls = calls_during(lambda: lockstep.publish('chatter', String(data='second')))
+    assert lockstep.last('answer').data == 'second'
+    whole = hasattr(calls_during.__code__, 'co_qualname')
+    left = [
+        (file, name if whole else name.split('.')[-1]) for _, file, name in listed('way to a process')
+    ]
+    for call in calls:
+        if left and call[0] == left[0]:
+            del left[0]
+    assert left == []

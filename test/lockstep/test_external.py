@@ -30,6 +30,7 @@ from diffdrive_jacobian.exploration.trial import MessageDigest
 from diffdrive_jacobian.faults import ClockPause, Corrupt, Delay, Hang, Kill, Loss, Slow, TimeJump
 from diffdrive_jacobian.lockstep.external import node_process
 from diffdrive_jacobian.lockstep.external.discovery import Discovery
+from diffdrive_jacobian.lockstep.external.graph import NodeGraph
 from diffdrive_jacobian.lockstep.external.launch import shared_memory_of
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -572,3 +573,14 @@ def test_a_daemon_of_a_process_takes_part(lockstep):
     received = lockstep.listen(Header, 'echo/out')
     send(lockstep, 'echo', 1.0)
     assert numbers(received) == [1.0]
+
+
+def test_only_what_was_remapped_has_another_name_in_the_world():
+    node = NodeGraph('node', '/', {}, {}, {}, {})
+    for topic, name in (
+        ('/node/lockstep/clock', '/clock'),
+        ('/node/lockstep_state', '/node/lockstep_state'),
+        ('/node/lockstep', '/node/lockstep'),
+        ('/other/lockstep/clock', '/other/lockstep/clock'),
+    ):
+        assert node.name_in_world(topic) == name

@@ -289,3 +289,40 @@ def test_numbers_are_compared_as_they_arrive_and_exactly(lockstep):
         publisher.publish(message)
         with pytest.raises(PropertyViolation, match=words):
             lockstep.settle()
+
+
+@dataclass(repr=False)
+class OnlyChecks(Property):
+    """Has a `check` of its own, and does not ask that of the base class."""
+
+    def begin(self):
+        self.on_published('joint_states', lambda *_: self.found('seen'))
+
+    def check(self):
+        return None
+
+
+def test_what_was_found_counts_whatever_check_returns(lockstep, publisher):
+    lockstep.require(OnlyChecks())
+    publisher.publish(joints(0.0))
+    with pytest.raises(PropertyViolation, match=r'^OnlyChecks\(\) is violated at 0 s: seen'):
+        lockstep.settle()
+
+
+def test_a_service_that_nobody_has_is_an_error(lockstep):
+    lockstep.require(HearsService('trigger'), HearsService('triggers'))
+    lockstep.create(Sender)
+    lockstep.run_for(0.1)
+    with pytest.raises(LockstepError, match=r"'triggers'\) observes /triggers, which"):
+        lockstep.finish()
+    lockstep.close()
+
+
+@dataclass(repr=False)
+class HearsService(Property):
+    """Notes responses."""
+
+    service: str
+
+    def begin(self):
+        self.on_response(self.service, lambda node, response: None)

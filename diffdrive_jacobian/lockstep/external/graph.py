@@ -86,7 +86,8 @@ class NodeGraph(NamedTuple):
 
     def name_in_world(self, topic: str) -> str:
         """Return the name of a topic without what the rules of `rules_apart` have put before it."""
-        return topic.removeprefix(f'{self.full_name}/{APART}') or topic
+        before = f'{self.full_name}/{APART}'
+        return topic.removeprefix(before) if topic.startswith(f'{before}/') else topic
 
 
 def shared_topics(nodes: Sequence[NodeGraph]) -> list[str]:

@@ -18,6 +18,7 @@ from diffdrive_jacobian.lockstep.external.linux import (
     Thread,
     code_of,
     stack_of,
+    stack_pointer,
 )
 from diffdrive_jacobian.lockstep.external.threads import THREADS_OF_DDS, Threads
 
@@ -65,7 +66,7 @@ class Idle:
         for thread in self._threads.others:
             number, *arguments = thread.idle.split() or [b'']
             if arguments:
-                self._depths[thread.tid] = int(arguments[-2], 16)
+                self._depths[thread.tid] = stack_pointer(arguments)
                 main = thread.tid == thread.pid
                 if main and number in FUTEX and self._addresses(thread, arguments):
                     self._spinning.add(thread)
@@ -106,7 +107,7 @@ class Idle:
             new = not _is_of_dds(thread)
             self.new_thread_waits |= new
             return new
-        if int(arguments[-2], 16) < self._depths[thread.tid] - DEEPER:
+        if stack_pointer(arguments) < self._depths[thread.tid] - DEEPER:
             return True
         if thread.tid in self._polling:
             return False
@@ -119,7 +120,7 @@ class Idle:
     def _is_elsewhere(self, thread: Thread) -> bool:
         """Return whether a thread waits, but not in DDS as in the idle process."""
         call = thread.idle.split()
-        if len(call) < 3 or int(call[-2], 16) == self._depths[thread.tid]:
+        if len(call) < 3 or stack_pointer(call) == self._depths[thread.tid]:
             return False
         return not self._addresses(thread, call[1:])
 

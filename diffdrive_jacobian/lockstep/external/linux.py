@@ -135,11 +135,19 @@ def code_of(thread: Thread, library: str) -> list[range]:
     ]
 
 
+def stack_pointer(call: list[bytes]) -> int:
+    """Return the address of the top of the stack of a thread in a system call, as /proc shows that.
+
+    The call is its number, its arguments, this address, and that of the instruction.
+    """
+    return int(call[-2], 16)
+
+
 def stack_of(thread: Thread, call: list[bytes]) -> array[int]:
     """Return the top of the stack of a thread that waits in a system call."""
     words = array('Q')
     with suppress(OSError), open(f'/proc/{thread.pid}/mem', 'rb', buffering=0) as memory:
-        words.frombytes(os.pread(memory.fileno(), STACK, int(call[-2], 16)))
+        words.frombytes(os.pread(memory.fileno(), STACK, stack_pointer(call)))
     return words
 
 

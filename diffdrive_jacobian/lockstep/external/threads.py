@@ -42,7 +42,7 @@ class Threads:
         self.own = [Thread(os.getpid(), tid, own=True) for tid in own]
         self._others: dict[tuple[int, int], Thread] = {}
         self.zombies: set[int] = set()
-        """Threads that have ended, and that nobody has waited for yet."""
+        """Threads that have ended and were not waited for. The main one has the id of its process."""
 
     def __iter__(self) -> Iterator[Thread]:
         """Yield all of them, those of this process last."""
