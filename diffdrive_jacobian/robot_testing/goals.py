@@ -23,7 +23,7 @@ from diffdrive_jacobian.messages.goal_status import (
 )
 from diffdrive_jacobian.numerics.checks import Names, NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.properties.base import ROUNDING, Property, end_of_faults
-from diffdrive_jacobian.properties.fields import field_reader
+from diffdrive_jacobian.robot_testing.fields import field_reader
 from diffdrive_jacobian.robot_testing.odometry import MotionProperty
 from diffdrive_jacobian.robot_testing.readings import Pose, Twist, planar, read_twist
 

@@ -24,7 +24,7 @@ from diffdrive_jacobian.numerics.checks import (
     PositiveOrInfinite,
 )
 from diffdrive_jacobian.properties.base import ROUNDING, Property
-from diffdrive_jacobian.properties.fields import field_reader
+from diffdrive_jacobian.robot_testing.fields import field_reader
 from diffdrive_jacobian.robot_testing.odometry import MotionProperty
 from diffdrive_jacobian.robot_testing.readings import Pose, Twist, read_twist
 from diffdrive_jacobian.time_units import NANOSECONDS

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.codecs import POSE_IN, TWIST_IN, pose_fields, twist_fields
 from diffdrive_jacobian.messages.structure import structure
-from diffdrive_jacobian.properties.fields import field_reader
+from diffdrive_jacobian.robot_testing.fields import field_reader
 
 
 class Pose(NamedTuple):

@@ -128,7 +128,7 @@ class Connecting:
                 if matched_by.is_used_up():
                     raise UnmatchedError(self._missing())
             elif time.monotonic() > begin + STARTING:
-                self._sleep_on()
+                self._end_sleep()
             time.sleep(PERIOD)
 
     def _missing(self) -> str:
@@ -196,7 +196,7 @@ class Connecting:
                 self._discovery.learn()
             passed = time.monotonic() - begin
             if number and passed > STARTING:
-                self._sleep_on()
+                self._end_sleep()
             if passed > periods * REPETITION and client.service_is_ready():
                 periods += 1
                 if response is None:
@@ -210,12 +210,12 @@ class Connecting:
             response = take_response(client) or response
         domain.node.destroy_client(client)
 
-    def _sleep_on(self) -> None:
+    def _end_sleep(self) -> None:
         """Let a process that sleeps before its nodes spin go on, in simulated wall time."""
         wall_time = self._domain.wall_time
         if wall_time is None or not self._domain.quiet.is_quiet() or self._spins():
             return
-        if wall_time.sleep_on():
+        if wall_time.end_sleep():
             self._waiting.wait()
 
     def _spins(self) -> bool:

@@ -117,7 +117,7 @@ class WallTime:
         """Return the threads that wait for a time, without executors."""
         return {int(one) for one in self._slots['thread'][self._slots['state'] == WAITS] if one > 0}
 
-    def sleep_on(self) -> bool:
+    def end_sleep(self) -> bool:
         """Advance to where the first that sleeps goes on, while the process starts. False: none does."""
         if (first := self.next(executors=False)) is None:
             return False
