@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -31,14 +32,17 @@ def listed(what='way'):
 
 
 def calls_during(run):
-    """Return the functions of the package that are called, each with those above it."""
+    """Return the functions of the package that are called, each with those above it.
+
+    They are found out afterwards: a process that is waited for would not wait for that.
+    """
     found = []
 
     def note(frame, event, _):
         if event == 'call':
             above = []
             while frame is not None:
-                above.append(function_of(frame.f_code))
+                above.append(frame.f_code)
                 frame = frame.f_back
             found.append(above)
 
@@ -47,9 +51,10 @@ def calls_during(run):
         run()
     finally:
         sys.setprofile(None)
-    return found
+    return [[*map(function_of, above)] for above in found]
 
 
+@cache
 def function_of(code):
     """Return file and name of a function; before Python 3.11 without its class."""
     path = Path(code.co_filename)
