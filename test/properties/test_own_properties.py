@@ -192,23 +192,26 @@ def test_bytes_that_are_no_message_violate_a_property_of_ones_own(lockstep, publ
         lockstep.settle()
 
 
-def test_a_topic_that_nobody_has_is_an_error_for_what_is_received_as_well(lockstep):
-    lockstep.require(Hears('joint_states'), Hears('joint_state'))
-    lockstep.create(Sender)
-    lockstep.run_for(0.1)
-    with pytest.raises(LockstepError, match=r"'joint_state'\) observes /joint_state, which"):
-        lockstep.finish()
-    lockstep.close()
-
-
 @dataclass(repr=False)
 class Hears(Property):
-    """Notes what is received."""
+    """Observes what is received, or what a service responds."""
 
-    topic: str
+    kind: str
+    name: str
 
     def begin(self):
-        self.on_delivered(self.topic, lambda node, kind, message: None)
+        observe = {'topic': self.on_delivered, 'service': self.on_response}[self.kind]
+        observe(self.name, lambda *_: None)
+
+
+@pytest.mark.parametrize(('kind', 'there'), [('topic', 'joint_states'), ('service', 'trigger')])
+def test_a_topic_or_a_service_that_nobody_has_is_an_error(lockstep, kind, there):
+    lockstep.require(Hears(kind, there), Hears(kind, 'misspelt'))
+    lockstep.create(Sender)
+    lockstep.run_for(0.1)
+    with pytest.raises(LockstepError, match=r"'misspelt'\) observes /misspelt, which no node has"):
+        lockstep.finish()
+    lockstep.close()
 
 
 @dataclass(repr=False)
@@ -307,22 +310,3 @@ def test_what_was_found_counts_whatever_check_returns(lockstep, publisher):
     publisher.publish(joints(0.0))
     with pytest.raises(PropertyViolation, match=r'^OnlyChecks\(\) is violated at 0 s: seen'):
         lockstep.settle()
-
-
-def test_a_service_that_nobody_has_is_an_error(lockstep):
-    lockstep.require(HearsService('trigger'), HearsService('triggers'))
-    lockstep.create(Sender)
-    lockstep.run_for(0.1)
-    with pytest.raises(LockstepError, match=r"'triggers'\) observes /triggers, which"):
-        lockstep.finish()
-    lockstep.close()
-
-
-@dataclass(repr=False)
-class HearsService(Property):
-    """Notes responses."""
-
-    service: str
-
-    def begin(self):
-        self.on_response(self.service, lambda node, response: None)

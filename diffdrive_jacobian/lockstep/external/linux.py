@@ -217,6 +217,11 @@ def lost_datagrams() -> dict[str, int]:
     return {row[9]: int(row[12]) for row in _udp_sockets()}
 
 
+def largest_queue() -> str:
+    """Return the size to which the system limits the queue of a socket without rights (bytes)."""
+    return Path(LIMIT).read_text().strip()
+
+
 def enlarge_queue(pid: int, descriptor: int) -> None:
     """Enlarge the queue of a socket of a process as far as the system allows it."""
     process = os.pidfd_open(pid)

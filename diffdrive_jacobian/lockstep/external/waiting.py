@@ -5,14 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
 
 from diffdrive_jacobian.lockstep._clock import Clocks
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep.external.command import Command
 from diffdrive_jacobian.lockstep.external.discovery import Discovery
 from diffdrive_jacobian.lockstep.external.domain import Domain
-from diffdrive_jacobian.lockstep.external.linux import LIMIT, QUEUE
+from diffdrive_jacobian.lockstep.external.linux import LIMIT, QUEUE, largest_queue
 from diffdrive_jacobian.lockstep.external.presence import Presence
 from diffdrive_jacobian.lockstep.external.quiet import LONGEST
 from diffdrive_jacobian.lockstep.external.relays import CALL, Arrived
@@ -137,7 +136,7 @@ class Waiting:
             raise LockstepError(
                 f'messages to or from {self._discovery.names} were lost at {self._seconds:g} s or '
                 f'before: more was sent at once than a socket can hold; {LIMIT} allows '
-                f'{Path(LIMIT).read_text().strip()} bytes, and may need {QUEUE}: '
+                f'{largest_queue()} bytes, and may need {QUEUE}: '
                 f'sysctl -w net.core.rmem_max={QUEUE}'
             )
 
