@@ -33,6 +33,7 @@ from diffdrive_jacobian.exploration.schedules import StopShrinking, generate, sh
 from diffdrive_jacobian.exploration.trial import Outcome, Setting, Trial, Violation
 from diffdrive_jacobian.numerics.checks import integer, number, positive_or_infinite
 from diffdrive_jacobian.properties.base import Property
+from diffdrive_jacobian.relations.base import Relation
 from diffdrive_jacobian.signals import one_interrupt
 from diffdrive_jacobian.text import error_text
 
@@ -50,6 +51,7 @@ def explore(
     scenario: Scenario,
     properties: Sequence[Property] = (),
     *,
+    relations: Sequence[Relation] = (),
     cases: Mapping[str, st.SearchStrategy[Any]] | st.SearchStrategy[Any] | None = None,
     faults: st.SearchStrategy[Any] | None = None,
     worlds: int = 1000,
@@ -70,6 +72,8 @@ def explore(
         scenario: `scenario(world, case)` creates nodes in a `Lockstep` and advances its time. A function
             at the top level of a module. The faults are injected before, and the properties required.
         properties: What must hold, such as `[StopsAfterLostOdometry(1.0)]`.
+        relations: How each world must compare with its image, such as `[Mirrored()]`. An image, and each
+            world that rounding needs, is run besides.
         cases: Strategies by name, such as `{'start': poses(), 'goal': goals()}`. The case is then a dict
             with these keys. A single strategy: the case is its value. None: the case is None.
         faults: Strategy of lists of faults, such as `fault_schedules(['odom'])`; None: no faults.
@@ -99,7 +103,10 @@ def explore(
             "if __name__ == '__main__':"
         )
     setting = Setting(
-        scenario=ScenarioName.of(scenario), properties=_checked_properties(properties), args=tuple(args)
+        scenario=ScenarioName.of(scenario),
+        properties=_checked('properties', Property, properties),
+        relations=_checked('relations', Relation, relations),
+        args=tuple(args),
     )
     try:
         integer('worlds', worlds, 1)
@@ -152,19 +159,20 @@ def explore(
                 used.shutdown(wait=True, cancel_futures=not complete)
 
 
-def _checked_properties(properties: Any) -> tuple[Property, ...]:
-    if isinstance(properties, Property):
-        raise ExplorationError(f'properties must be a list: [{properties!r}]')
-    if not isinstance(properties, Iterable):
-        raise ExplorationError(f'properties must be a list, got {properties!r}')
-    checked = tuple(properties)
+def _checked(name: str, kind: Any, values: Any) -> tuple[Any, ...]:
+    """Return the properties or the relations that were given."""
+    if isinstance(values, kind):
+        raise ExplorationError(f'{name} must be a list: [{values!r}]')
+    if not isinstance(values, Iterable):
+        raise ExplorationError(f'{name} must be a list, got {values!r}')
+    checked = tuple(values)
     for one in checked:
-        if not isinstance(one, Property):
+        if not isinstance(one, kind):
             hint = '; create one: ' + one.__name__ + '(...)' if isinstance(one, type) else ''
-            raise ExplorationError(f'properties must be instances of Property, got {one!r}{hint}')
+            raise ExplorationError(f'{name} must be instances of {kind.__name__}, got {one!r}{hint}')
     keys = Counter(map(repr, checked))
     if twice := [key for key, count in keys.items() if count > 1]:
-        raise ExplorationError(f'each property can be given once, got {twice[0]} again')
+        raise ExplorationError(f'{name}: each can be given once, got {twice[0]} again')
     for one in checked:
         # A test will contain it.
         Source().expression(one)
@@ -212,6 +220,8 @@ class Search:
     worlds: int = 0
     faults: int = 0
     checks: int = 0
+    compared: Counter[str] = field(default_factory=Counter)
+    """By relation."""
     simulated: float = 0.0
     stopped: str = ''
 
@@ -256,10 +266,14 @@ class Search:
             simulated=self.simulated,
             faults=self.faults,
             checks=self.checks,
+            compared=self.compared.total(),
             stopped=self.stopped,
-            notes=tuple(
-                f'{text} ({count} of {self.worlds} worlds)'
-                for text, count in self.complaints.most_common()
+            notes=(
+                *(f'{one}: nothing was compared' for one, count in self.compared.items() if not count),
+                *(
+                    f'{text} ({count} of {self.worlds} worlds)'
+                    for text, count in self.complaints.most_common()
+                ),
             ),
         )
 
@@ -319,10 +333,11 @@ class Search:
         self.worlds += 1
         self.faults += len(one.trial.faults)
         self.checks += outcome.checks
+        self.compared.update(outcome.compared)
         self.simulated += outcome.seconds
         if outcome.complaints and not one.trial.faults:
             raise ExplorationError(f'in a world without faults: {outcome.complaints[0]}')
-        self.complaints.update(outcome.complaints)
+        self.complaints.update([*outcome.complaints, *outcome.notes])
         self.known.setdefault(one.block, {})[one.key] = outcome
         for violation in outcome.violations:
             self.counts[violation.key] += 1

@@ -35,6 +35,7 @@ from diffdrive_jacobian.exploration.written_test import case_source, test_source
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.text import error_text
+from diffdrive_jacobian.time_units import nanoseconds
 
 
 def check_output(folder: Path) -> None:
@@ -127,26 +128,25 @@ def _record_in_process(*arguments: Any) -> list[str]:
 def record(setting: Setting, trial: Trial, only: int, folder: str) -> list[str]:
     """Run a world, write its bag and its picture into a folder, and return what could not be written."""
     bag = Path(folder) / BAG
-    ended = 0
+    begin = 0
 
     @contextmanager
     def recording(world: Lockstep) -> Iterator[None]:
-        nonlocal ended
+        nonlocal begin
         writing = Recording(bag, lossless=True)
-        now = record_world(world, writing)
+        begin = record_world(world, writing)()
         try:
             yield
         finally:
-            ended = now()
             writing.finish()
 
     try:
         outcome = run(setting, trial, only=only, during=recording)
     except (RecordingError, OSError) as error:
         return [f'no bag: {error}']
-    # A violation ends the world.
     marks = [
-        (ended, f'violated: {one.key}' if one.index >= 0 else one.key) for one in outcome.violations[:1]
+        (begin + nanoseconds(one.seconds), f'violated: {one.key}' if one.index >= 0 else one.key)
+        for one in outcome.violations[:1]
     ]
     why = draw(bag, Path(folder) / PICTURE, marks)
     return [f'no picture: {why}'] if why else []

@@ -6,7 +6,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -84,7 +84,7 @@ class Finding:
     trial: Trial
     """The smallest case, with its faults."""
     setting: Setting
-    """The scenario and the properties."""
+    """The scenario, the properties and the relations."""
     count: int
     """Number of worlds that violated it."""
     first_world: int
@@ -155,6 +155,8 @@ class Exploration:
     """Number of faults in these worlds."""
     checks: int
     """How often a property was checked."""
+    compared: int = 0
+    """Number of messages that were compared with their images."""
     stopped: str = ''
     """Why not all worlds ran; empty: they did."""
     notes: tuple[str, ...] = ()
@@ -198,7 +200,8 @@ class Exploration:
             f'{self.worlds} worlds of {self.wanted} in {self.seconds:.1f} s '
             f'({self.rate:.1f} worlds/s), {self.simulated:.0f} s of simulated time, seed {self.seed}',
             f'{self.faults} faults injected, {self.checks} checks of properties, '
-            f'{len(self.findings)} violated',
+            + (f'{self.compared} messages compared with images, ' if self.compared else '')
+            + f'{len(self.findings)} violated',
         ]
         if self.findings:
             lines.append(
@@ -253,24 +256,25 @@ class Replay:
 
 
 @contextmanager
-def reproducing(world: Lockstep, case: Path) -> Iterator[None]:
+def reproducing(world: Lockstep | None, case: Path) -> Iterator[None]:
     """Add to an exception that the body raises how it compares with what `explore` found.
 
     It is the same bit for bit with the same versions and the same features of the processor. Elsewhere
     the verdict is the same, but numbers may be rounded otherwise.
 
     Args:
-        world: The world in which the body runs the case.
+        world: The world in which the body runs the case; None: it calls `check_relation`.
         case: The file counterexample.json.
     """
     fields = json.loads(case.read_text(encoding='utf-8'))
     found = fields['violation'], fields['seconds'], fields['digest']
-    with MessageDigest(world) as messages:
+    with nullcontext() if world is None else MessageDigest(world) as messages:
         try:
             yield
         except (Exception, SystemExit) as error:
-            violation = of_exception(error, world)
-            compared = Replay.compared(violation, messages.value(), found, fields['versions'])
+            violation = of_exception(error, 0.0 if world is None else world.world_seconds)
+            digest = getattr(error, 'digest', '') if messages is None else messages.value()
+            compared = Replay.compared(violation, digest, found, fields['versions'])
             # As add_note of Python 3.11.
             error.__notes__ = [*getattr(error, '__notes__', []), str(compared)]  # type: ignore[union-attr]
             raise

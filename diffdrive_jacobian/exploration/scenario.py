@@ -101,7 +101,7 @@ def _public(module: str, name: str) -> str:
     return module
 
 
-PUBLIC = tuple(f'diffdrive_jacobian.{name}' for name in ('faults', 'properties', 'testing'))
+PUBLIC = tuple(f'diffdrive_jacobian.{name}' for name in ('faults', 'properties', 'relations', 'testing'))
 """Packages whose names a written test may import."""
 Scenario = Callable[[Any, Any], object]
 """`scenario(world, case)` creates the nodes in a `Lockstep` and advances its time."""

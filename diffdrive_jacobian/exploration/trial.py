@@ -6,9 +6,9 @@ import hashlib
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -19,6 +19,8 @@ from rclpy.serialization import deserialize_message
 import diffdrive_jacobian
 from diffdrive_jacobian.exploration.scenario import ScenarioName
 from diffdrive_jacobian.faults import Fault
+from diffdrive_jacobian.faults.fault import Expression
+from diffdrive_jacobian.lockstep._border import Said
 from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep._properties import answer
 from diffdrive_jacobian.lockstep.world import Lockstep
@@ -35,8 +37,11 @@ from diffdrive_jacobian.messages.structure import (
 )
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.properties.base import Property
+from diffdrive_jacobian.relations.base import Relation
+from diffdrive_jacobian.relations.checking import Ran, Scene, checked
 from diffdrive_jacobian.ros.rclpy_internals import wrap_publish
 from diffdrive_jacobian.text import error_text, printable_lines
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 QUIET = ('--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
 """ROS arguments of explored worlds. Logs of thousands of worlds help nobody, and take time."""
@@ -54,8 +59,13 @@ class Setting:
 
     scenario: ScenarioName
     properties: tuple[Property, ...]
+    relations: tuple[Relation, ...] = ()
     args: tuple[str, ...] = ()
     """ROS arguments of all nodes."""
+
+    def required(self, index: int) -> Expression:
+        """Return the property, or after those the relation, with an index."""
+        return (*self.properties, *self.relations)[index]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +91,7 @@ class Violation:
     name: str
     """Short name, a valid identifier."""
     index: int = -1
-    """Index of the property; -1: an exception."""
+    """Index of the property, or after those of the relation; -1: an exception."""
     message: str = ''
     """Kind and first line of an exception."""
 
@@ -99,10 +109,14 @@ class Outcome:
     """In the order in which they happened."""
     checks: int = 0
     """How often a property was checked."""
+    compared: Mapping[str, int] = field(default_factory=dict)
+    """Number of messages that were compared with their images, by relation."""
     seconds: float = 0.0
-    """Duration in simulated time (s)."""
+    """Duration in simulated time (s), with the images."""
     complaints: tuple[str, ...] = ()
-    """What faults or a property needed and did not find."""
+    """What faults, a property or a relation needed and did not find."""
+    notes: tuple[str, ...] = ()
+    """What relations did not compare."""
     digest: str = ''
     """Hash of all messages, if it was asked for."""
 
@@ -165,10 +179,11 @@ def run(
     Args:
         setting: What all worlds have in common.
         trial: The case and the faults.
-        only: Index of the one property to check, whose violation ends the world; None: all of them,
-            and the world goes on after a violation. -1: only exceptions count, also of properties.
+        only: Index of the one property or relation to check; the violation of a property ends the world.
+            None: all of them, and the world goes on after a violation. -1: only exceptions count, also
+            of properties.
         digest: Whether to compute the hash of all messages.
-        during: Returns a context manager in which the world is run.
+        during: Returns a context manager in which the world is run, but not its images.
 
     Raises:
         ExplorationError: The scenario cannot be imported.
@@ -182,6 +197,11 @@ def run(
         for index, one in enumerate(setting.properties)
         if only in (None, -1, index)
     ]
+    relations = {
+        index: one
+        for index, one in enumerate(setting.relations, len(setting.properties))
+        if only in (None, index)
+    }
     arguments = [*(setting.args or ['--ros-args']), '--ros-args', *QUIET]
     with Lockstep(arguments) as world, during(world):
         hashed: AbstractContextManager[MessageDigest | None] = (
@@ -190,22 +210,70 @@ def run(
         with hashed as messages:
             world.inject(*trial.faults, seed=trial.seed)
             world.require(*properties)
-            try:
-                scenario(world, trial.case)
-                complaints = _finish(world)
-            except KeyboardInterrupt:
-                raise
-            except BaseException as error:
-                # What ends the world because of `only` is collected already.
-                if not isinstance(getattr(error, 'property', None), _Collecting):
-                    violations.append(of_exception(error, world))
-        return Outcome(
+            first: Ran | None = None
+            with Said(world) if relations else nullcontext() as said:
+                ended: BaseException | None = None
+                try:
+                    scenario(world, trial.case)
+                    complaints = _finish(world)
+                except KeyboardInterrupt:
+                    raise
+                except BaseException as error:
+                    ended = error
+                    # What ends the world because of `only` is collected already.
+                    if not isinstance(getattr(error, 'property', None), _Collecting):
+                        violations.append(of_exception(error, world.world_seconds))
+                if said is not None:
+                    first = Ran.of(world, said, ended)
+        outcome = Outcome(
             violations=tuple(one for one in violations if only != -1 or one.index < 0),
             checks=sum(one.checks for one in properties),
             seconds=world.world_seconds,
             complaints=complaints,
             digest='' if messages is None else messages.value(),
         )
+    if first is None:
+        return outcome
+    scene = Scene(
+        scenario=scenario, case=trial.case, faults=trial.faults, seed=trial.seed, args=arguments
+    )
+    return _with_images(outcome, relations, first, scene)
+
+
+def _with_images(
+    outcome: Outcome, relations: Mapping[int, Relation], first: Ran, scene: Scene
+) -> Outcome:
+    """Add to the outcome of a world how its images compare with it."""
+    worlds = {tuple(scene.faults): (first, scene)}
+    for index, relation in relations.items():
+        faults = tuple(one for one in scene.faults if not relation.is_disturbed_by(one))
+        try:
+            if faults not in worlds:
+                undisturbed = replace(scene, faults=faults)
+                ran = undisturbed.run('the world without faults that disturb the relation')
+                worlds[faults] = ran, undisturbed
+                outcome = replace(outcome, seconds=outcome.seconds + ran.end / NANOSECONDS)
+            result = checked(relation, *worlds[faults])
+        except LockstepError as error:
+            complaint = str(error).partition('\n')[0]
+            outcome = replace(outcome, complaints=(*outcome.complaints, complaint))
+            continue
+        outcome = replace(
+            outcome,
+            compared={**outcome.compared, repr(relation): result.compared},
+            seconds=outcome.seconds + result.seconds,
+            notes=(*outcome.notes, *([f'{relation!r}: {result.note}'] if result.note else ())),
+        )
+        if result.difference is not None:
+            violation = Violation(
+                key=printable_lines(repr(relation)),
+                seconds=result.difference.time / NANOSECONDS,
+                text=printable_lines(result.difference.text)[:LONGEST_TEXT],
+                name=type(relation).__name__,
+                index=index,
+            )
+            outcome = replace(outcome, violations=(*outcome.violations, violation), digest=result.digest)
+    return outcome
 
 
 def _finish(world: Lockstep) -> tuple[str, ...]:
@@ -221,8 +289,8 @@ def _finish(world: Lockstep) -> tuple[str, ...]:
     return ()
 
 
-def of_exception(error: BaseException, world: Lockstep) -> Violation:
-    """Return an exception of a node or of the scenario as a violation."""
+def of_exception(error: BaseException, seconds: float) -> Violation:
+    """Return an exception of a node or of the scenario as a violation, at a world time (s)."""
     kind = type(error).__name__
     key = f'{kind}{_place(error.__traceback__)}'
     if isinstance(error, PropertyViolation):
@@ -233,7 +301,7 @@ def of_exception(error: BaseException, world: Lockstep) -> Violation:
     return Violation(
         key=printable_lines(key),
         name=f'NoException{kind}',
-        seconds=world.world_seconds,
+        seconds=error.seconds if isinstance(error, PropertyViolation) else seconds,
         text=printable_lines(text)[-LONGEST_TEXT:],
         message=f'{kind}: {first}'[:LONGEST_LINE] if first else kind,
     )

@@ -11,6 +11,7 @@ from pathlib import Path
 from diffdrive_jacobian.exploration.own_files import CASE
 from diffdrive_jacobian.exploration.result import LONGEST_KEY, Finding
 from diffdrive_jacobian.exploration.scenario import Source
+from diffdrive_jacobian.relations.base import Relation
 from diffdrive_jacobian.text import printable
 
 TESTING = 'diffdrive_jacobian.testing'
@@ -27,11 +28,17 @@ HERE = Path(__file__).resolve().parent
 CASE = {case}
 {faults}
 
-{marker}def test_{name}(lockstep):
-{inject}{require}    with reproducing(lockstep, HERE / '{file}'):
-        {scenario}(lockstep, CASE)
-        lockstep.finish()
+{test}
 '''
+IN_WORLD = """{marker}def test_{name}(lockstep):
+{inject}{require}    # To stop there in a debugger: lockstep.pause_at({seconds!r})
+    with reproducing(lockstep, HERE / '{file}'):
+        {scenario}(lockstep, CASE)
+        lockstep.finish()"""
+WITH_IMAGE = """def test_{name}():
+    # To stop there in a debugger: check_relation(..., pause_at={seconds!r})
+    with reproducing(None, HERE / '{file}'):
+        check_relation({scenario}, {relation}, case=CASE{arguments})"""
 
 
 def case_source(finding: Finding, seed: int) -> str:
@@ -61,15 +68,21 @@ def test_source(finding: Finding, folder: Path, name: str, seed: int) -> str:
     scenario = setting.scenario
     case = source.expression(trial.case)
     faults = ', '.join(map(source.expression, trial.faults))
-    required = ''
+    required = relation = ''
     key = printable(violation.key, LONGEST_KEY)
     title, description = f'{key}, at {violation.seconds:g} s.', violation.headline
     if violation.index >= 0:
         title = f'{key} is violated at {violation.seconds:g} s.'
         description = '\n'.join(violation.text.strip().splitlines()[:10])
-        expression = source.expression(setting.properties[violation.index])
-        required = f'    lockstep.require({expression})\n'
+        one = setting.required(violation.index)
+        expression = source.expression(one)
+        if isinstance(one, Relation):
+            relation = expression
+        else:
+            required = f'    lockstep.require({expression})\n'
     imported = {(TESTING, 'reproducing')}
+    if relation:
+        imported.add(('diffdrive_jacobian.relations', 'check_relation'))
     loads = []
     for module, member in ((scenario.module, scenario.name), *sorted(source.imports)):
         if scenario.root is None or module.startswith('diffdrive_jacobian.'):
@@ -78,9 +91,22 @@ def test_source(finding: Finding, folder: Path, name: str, seed: int) -> str:
             place = _place(Path(scenario.root), folder.resolve())
             loads.append(f'{member} = scenario_from({place}, {module!r}, {member!r})')
             imported.add((TESTING, 'scenario_from'))
-    imports = ['from pathlib import Path', '', *(['import pytest', ''] if setting.args else [])]
+    needs_pytest = setting.args and not relation
+    imports = ['from pathlib import Path', '', *(['import pytest', ''] if needs_pytest else [])]
     for module, group in groupby(sorted(imported), key=itemgetter(0)):
         imports.append(f'from {module} import {", ".join(member for _, member in group)}')
+    common = {'name': name, 'seconds': violation.seconds, 'file': CASE, 'scenario': scenario.name}
+    if relation:
+        arguments = f', faults=FAULTS, seed={trial.seed}' if trial.faults else ''
+        arguments += f', args={list(setting.args)!r}' if setting.args else ''
+        test = WITH_IMAGE.format(**common, relation=relation, arguments=arguments)
+    else:
+        test = IN_WORLD.format(
+            **common,
+            marker=f'@pytest.mark.lockstep(args={list(setting.args)!r})\n' if setting.args else '',
+            inject=f'    lockstep.inject(*FAULTS, seed={trial.seed})\n' if trial.faults else '',
+            require=required,
+        )
     return TEST.format(
         title=_quoted(title),
         description=_quoted(description),
@@ -89,12 +115,7 @@ def test_source(finding: Finding, folder: Path, name: str, seed: int) -> str:
         loads='\n'.join(loads),
         case=case,
         faults=f'FAULTS = [{faults}]\n' if trial.faults else '',
-        marker=f'@pytest.mark.lockstep(args={list(setting.args)!r})\n' if setting.args else '',
-        name=name,
-        inject=f'    lockstep.inject(*FAULTS, seed={trial.seed})\n' if trial.faults else '',
-        require=required,
-        file=CASE,
-        scenario=scenario.name,
+        test=test,
     )
 
 

@@ -282,7 +282,10 @@ class Injection:
 
     def _stage(self, filtered: _Filtered, node: Node, message_type: type) -> Stage:
         topic, name = filtered.topic, node.get_fully_qualified_name()
-        change = filtered.begin(self.rng(f'{name} {topic}'), message_type)
+        # The same in each namespace.
+        root = self.world.node.get_namespace().rstrip('/')
+        key = f'{name.removeprefix(root)} {topic.removeprefix(root)}'
+        change = filtered.begin(self.rng(key), message_type)
         self._filters.append(change)
         observe = getattr(change, 'observe', None)
         hits = Hits(f'{topic} to {name}', self.note)

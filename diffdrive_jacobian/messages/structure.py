@@ -241,6 +241,20 @@ def walk(
             yield path, kind, value
 
 
+def parts(message: Any) -> Iterator[tuple[Structure, Any]]:
+    """Yield a message and all messages in it, each with its type, the outer ones first."""
+    kind = structure(type(message))
+    yield kind, message
+    for name, field in kind.fields:
+        value = getattr(message, name)
+        match field:
+            case Structure():
+                yield from parts(value)
+            case Array(Structure()) | Sequence(Structure()):
+                for one in value:
+                    yield from parts(one)
+
+
 def plain(value: Any) -> Any:
     """Return an array or a sequence of numbers or strings as a tuple of Python's; others as they are."""
     if isinstance(value, (str, bytes, int, float)):

@@ -1,0 +1,143 @@
+"""Relations of whole worlds: all nodes run again, at another time or under other names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rclpy.exceptions import InvalidNamespaceException
+from rclpy.validate_namespace import validate_namespace
+
+from diffdrive_jacobian.faults import Fault
+from diffdrive_jacobian.lockstep._border import Endpoints
+from diffdrive_jacobian.messages.conversion import set_time
+from diffdrive_jacobian.messages.structure import Text, parts
+from diffdrive_jacobian.numerics.checks import Positive, nonempty
+from diffdrive_jacobian.relations.base import Relation
+from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
+
+GLOBAL = ('/tf', '/tf_static')
+"""Topics that all robots share, whose names stay."""
+TIME = 'builtin_interfaces/Time'
+
+
+@dataclass(frozen=True, repr=False)
+class WholeWorld(Relation):
+    """All nodes are under test, with the world in which they are. Base class."""
+
+    @property
+    def start(self) -> float:
+        """How much later the clock of the nodes shows at the start (s)."""
+        return 0.0
+
+    @property
+    def args(self) -> tuple[str, ...]:
+        """ROS arguments of all nodes, before those of the world."""
+        return ()
+
+    @property
+    def period(self) -> float:
+        """How far events may be apart (s). What comes after the first such event is not compared."""
+        return 0.0
+
+    def under_test(self, nodes: Mapping[str, Endpoints], namespace: str) -> set[str]:
+        """Return all nodes, or that which is named."""
+        return Relation.under_test(self, nodes, namespace) if self.node else {*nodes}
+
+    def renamed(self, name: str, namespace: str) -> str:
+        """Return the full name of a node or a topic in the image."""
+        return name
+
+    def compared(self, message: Any) -> Any:
+        """Return a message of the image as it is compared."""
+        return message
+
+
+@dataclass(frozen=True, repr=False)
+class Shifted(WholeWorld):
+    """At another time all nodes do the same.
+
+    Their clocks show other times from the start on. All stamps must be shifted. Rounding of times may
+    move events by one `period`. It is compared without faults that let the clock jump, because it
+    cannot jump to a time before 0.
+
+    Attributes:
+        seconds: How much later it is (s).
+        period: The longest period of the timers (s). From the first event on that is moved by up to this
+            time, nothing is compared.
+    """
+
+    seconds: Positive = 1000.0
+    period: Positive = field(default=0.1, kw_only=True)
+
+    @property
+    def start(self) -> float:
+        """How much later the clock of the nodes shows at the start (s)."""
+        return self.seconds
+
+    def is_disturbed_by(self, fault: Fault) -> bool:
+        """Return whether the clock jumps."""
+        return bool(fault.clock_jumps)
+
+    def image(self, topic: str, message: Any) -> Any:
+        """Return the message with later stamps. A stamp of zero means that there is none."""
+        for kind, part in parts(message):
+            if kind.name == TIME and (part.sec or part.nanosec):
+                set_time(part, part.sec * NANOSECONDS + part.nanosec + nanoseconds(self.seconds))
+        return message
+
+
+def _namespace(name: str, value: Any) -> str:
+    """Require a namespace, such as /robot1."""
+    full = f'/{str(nonempty(name, value)).lstrip("/")}'
+    try:
+        validate_namespace(full)
+    except InvalidNamespaceException as error:
+        why = str(error).splitlines()[0].rstrip(':')
+        raise ValueError(f"{name} must be a namespace such as '/robot1', got {value!r}: {why}") from None
+    return full
+
+
+@dataclass(frozen=True, repr=False)
+class Renamed(WholeWorld):
+    """In another namespace all nodes do the same.
+
+    Names of topics and nodes must be in it, but for /tf and /tf_static. Names of frames and other texts
+    may begin with it. A node in another process is in a namespace only if its command says so.
+
+    Attributes:
+        namespace: The namespace.
+    """
+
+    namespace: str = '/renamed'
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        try:
+            object.__setattr__(self, 'namespace', _namespace('namespace', self.namespace))
+        except ValueError as error:
+            raise ValueError(f'Renamed: {error}') from None
+
+    @property
+    def args(self) -> tuple[str, ...]:
+        """ROS arguments of all nodes, before those of the world."""
+        return '--ros-args', '-r', f'__ns:={self.namespace}'
+
+    def image(self, topic: str, message: Any) -> Any:
+        """Return the message."""
+        return message
+
+    def renamed(self, name: str, namespace: str) -> str:
+        """Return the full name of a node or a topic in the image."""
+        return name if name in GLOBAL else self.namespace + name.removeprefix(namespace.rstrip('/'))
+
+    def compared(self, message: Any) -> Any:
+        """Return a message without the namespace in its texts."""
+        for kind, part in parts(message):
+            for name, one in kind.fields:
+                if isinstance(one, Text):
+                    text = getattr(part, name).removeprefix(f'{self.namespace}/')
+                    setattr(part, name, text.removeprefix(f'{self.namespace[1:]}/'))
+        return message

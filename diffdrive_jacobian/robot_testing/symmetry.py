@@ -1,0 +1,259 @@
+"""Relations of a robot in the plane: what is right in one place is right in another, and in a mirror.
+
+They know the messages of geometry_msgs and those that consist of them, such as those of nav_msgs and of
+/tf. Messages of sensor_msgs have no image: define one in a subclass.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any, ClassVar
+
+from diffdrive_jacobian.faults.fault import RosName
+from diffdrive_jacobian.lockstep._border import Endpoints
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.messages import structure as types
+from diffdrive_jacobian.messages.structure import Structure, structure
+from diffdrive_jacobian.numerics.checks import Finite
+from diffdrive_jacobian.relations.base import Relation
+
+OF_ROBOT = ('base_link', 'base_footprint')
+"""Frames of a robot, without a prefix: what is given in them is where it is, seen from the robot."""
+POSES = ('geometry_msgs/Pose', 'geometry_msgs/Transform')
+TWISTS = ('geometry_msgs/Twist', 'geometry_msgs/Accel', 'geometry_msgs/Wrench')
+POINTS = ('geometry_msgs/Point', 'geometry_msgs/Point32')
+WITHOUT = ('nav_msgs/OccupancyGrid', 'nav_msgs/MapMetaData')
+"""Types without an image, beside those of sensor_msgs."""
+
+
+@dataclass(frozen=True, repr=False)
+class PlaneRelation(Relation):
+    """Poses, paths, odometry and goals are changed, and commands must be. Base class.
+
+    Attributes:
+        commands: Topic of the commands. The nodes under test are those that publish it, unless `node`
+            names one.
+    """
+
+    commands: RosName = field(default='cmd_vel', kw_only=True)
+
+    def under_test(self, nodes: Mapping[str, Endpoints], namespace: str) -> set[str]:
+        """Return the nodes that publish commands."""
+        return self._with_topic(nodes, namespace, self.commands, 'published')
+
+    def image(self, topic: str, message: Any) -> Any:
+        """Return the image of a message.
+
+        Raises:
+            LockstepError: It has none.
+        """
+        self._change(structure(type(message)), message, topic, of_robot=False)
+        return message
+
+    def _change(self, kind: Structure, message: Any, topic: str, *, of_robot: bool) -> None:
+        """Change a message, or a part of one, which is given in the frame of a robot if `of_robot`."""
+        frame = getattr(getattr(message, 'header', None), 'frame_id', '')
+        if frame:
+            of_robot = frame.rpartition('/')[2] in OF_ROBOT
+        match kind.name:
+            case 'geometry_msgs/TransformStamped':
+                child = message.child_frame_id.rpartition('/')[2] in OF_ROBOT
+                self._transform(message.transform, of_robot=of_robot, to_robot=child)
+            case name if name in POSES:
+                position = message.position if hasattr(message, 'position') else message.translation
+                orientation = getattr(message, 'orientation', None) or message.rotation
+                if _is_finite(position) and _is_finite(orientation):
+                    self._point(position, of_robot=of_robot)
+                    self._rotation(orientation, of_robot=of_robot)
+            case 'geometry_msgs/Pose2D':
+                self._pose_2d(message, of_robot=of_robot)
+            case 'geometry_msgs/PoseWithCovariance':
+                self._change(_type(kind, 'pose'), message.pose, topic, of_robot=of_robot)
+                message.covariance = self._covariance(message.covariance, of_robot=of_robot)
+            case 'geometry_msgs/TwistWithCovariance':
+                self._change(_type(kind, 'twist'), message.twist, topic, of_robot=of_robot)
+                message.covariance = self._covariance(message.covariance, of_robot=True)
+            case name if name in TWISTS:
+                first, second = (getattr(message, one) for one, _ in kind.fields)
+                self._twist(first, second)
+            case name if name in POINTS:
+                self._point(message, of_robot=of_robot)
+            case 'geometry_msgs/Quaternion':
+                self._rotation(message, of_robot=of_robot)
+            case 'geometry_msgs/Vector3':
+                self._vector(message, of_robot=of_robot)
+            case name if name in WITHOUT or name.startswith('sensor_msgs/'):
+                raise LockstepError(
+                    f'{self!r} has no image of {name} on {topic}: define image(topic, message) in a '
+                    'subclass'
+                )
+            case _:
+                for name, one in kind.fields:
+                    value = getattr(message, name)
+                    match one:
+                        case Structure():
+                            self._change(one, value, topic, of_robot=of_robot)
+                        case types.Array(Structure() as element) | types.Sequence(
+                            Structure() as element
+                        ):
+                            for part in value:
+                                self._change(element, part, topic, of_robot=of_robot)
+
+    @abstractmethod
+    def _point(self, point: Any, *, of_robot: bool) -> None:
+        """Change a position."""
+
+    @abstractmethod
+    def _vector(self, vector: Any, *, of_robot: bool) -> None:
+        """Change a direction."""
+
+    @abstractmethod
+    def _rotation(self, quaternion: Any, *, of_robot: bool) -> None:
+        """Change an orientation."""
+
+    @abstractmethod
+    def _pose_2d(self, pose: Any, *, of_robot: bool) -> None:
+        """Change a pose in the plane."""
+
+    @abstractmethod
+    def _twist(self, linear: Any, angular: Any) -> None:
+        """Change a twist of the robot in its own frame."""
+
+    @abstractmethod
+    def _covariance(self, covariance: Sequence[float], *, of_robot: bool) -> list[float]:
+        """Return the covariance of a pose or of a twist: x, y, z and the rotations about them."""
+
+    @abstractmethod
+    def _transform(self, transform: Any, *, of_robot: bool, to_robot: bool) -> None:
+        """Change a transform from one frame to another."""
+
+
+@dataclass(frozen=True, repr=False)
+class Moved(PlaneRelation):
+    """Elsewhere in the plane the robot is driven in the same way: the commands are equal.
+
+    Positions and headings are turned about the origin by `theta`, then moved by `x` and `y`. Those in a
+    frame `base_link` or `base_footprint` stay.
+
+    Attributes:
+        x: (m)
+        y: (m)
+        theta: (rad)
+    """
+
+    x: Finite = 3.0
+    y: Finite = -2.0
+    theta: Finite = 3.0
+
+    def _point(self, point: Any, *, of_robot: bool) -> None:
+        if not of_robot:
+            self._vector(point, of_robot=False)
+            point.x += self.x
+            point.y += self.y
+
+    def _vector(self, vector: Any, *, of_robot: bool) -> None:
+        if not of_robot:
+            c, s = math.cos(self.theta), math.sin(self.theta)
+            vector.x, vector.y = c * vector.x - s * vector.y, s * vector.x + c * vector.y
+
+    def _rotation(self, quaternion: Any, *, of_robot: bool) -> None:
+        if of_robot:
+            return
+        c, s, q = math.cos(self.theta / 2.0), math.sin(self.theta / 2.0), quaternion
+        x, y, z, w = c * q.x - s * q.y, c * q.y + s * q.x, c * q.z + s * q.w, c * q.w - s * q.z
+        # Of the two that are the same rotation, that which odometry has.
+        sign = -1.0 if w < 0.0 else 1.0
+        q.x, q.y, q.z, q.w = sign * x, sign * y, sign * z, sign * w
+
+    def _pose_2d(self, pose: Any, *, of_robot: bool) -> None:
+        if not of_robot:
+            self._point(pose, of_robot=False)
+            pose.theta = math.remainder(pose.theta + self.theta, math.tau)
+
+    def _twist(self, linear: Any, angular: Any) -> None:
+        """It stays."""
+
+    def _covariance(self, covariance: Sequence[float], *, of_robot: bool) -> list[float]:
+        if of_robot:
+            return list(covariance)
+        c, s = math.cos(self.theta), math.sin(self.theta)
+        turn = ((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0))
+        axes = range(3)
+        turned = [0.0] * 36
+        # Blocks of three rows and columns: positions and rotations turn alike.
+        for up, left in product((0, 3), repeat=2):
+            for i, j in product(axes, repeat=2):
+                turned[6 * (up + i) + left + j] = sum(
+                    turn[i][k] * covariance[6 * (up + k) + left + m] * turn[j][m]
+                    for k, m in product(axes, repeat=2)
+                )
+        return turned
+
+    def _transform(self, transform: Any, *, of_robot: bool, to_robot: bool) -> None:
+        if of_robot:
+            return
+        if not to_robot:
+            # Between two frames that do not move with a robot, both of which are moved: back first.
+            self._move_back(transform)
+        self._point(transform.translation, of_robot=False)
+        self._rotation(transform.rotation, of_robot=False)
+
+    def _move_back(self, transform: Any) -> None:
+        """Let a transform begin where the other frame is not moved yet."""
+        q, shift = transform.rotation, transform.translation
+        yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2)) - self.theta
+        c, s = math.cos(yaw), math.sin(yaw)
+        shift.x -= c * self.x - s * self.y
+        shift.y -= s * self.x + c * self.y
+        back = Moved(0.0, 0.0, -self.theta)
+        back._rotation(q, of_robot=False)
+
+
+@dataclass(frozen=True, repr=False)
+class Mirrored(PlaneRelation):
+    """In the mirror the robot is driven in the mirrored way: v is the same, omega is negated.
+
+    Left and right are exchanged: y and rotations about x and z change their signs.
+    """
+
+    signs: ClassVar[tuple[float, ...]] = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
+    """Of x, y, z and the rotations about them."""
+
+    def _point(self, point: Any, *, of_robot: bool) -> None:
+        point.y = -point.y
+
+    def _vector(self, vector: Any, *, of_robot: bool) -> None:
+        vector.y = -vector.y
+
+    def _rotation(self, quaternion: Any, *, of_robot: bool) -> None:
+        quaternion.x, quaternion.z = -quaternion.x, -quaternion.z
+
+    def _pose_2d(self, pose: Any, *, of_robot: bool) -> None:
+        pose.y, pose.theta = -pose.y, -pose.theta
+
+    def _twist(self, linear: Any, angular: Any) -> None:
+        linear.y, angular.x, angular.z = -linear.y, -angular.x, -angular.z
+
+    def _covariance(self, covariance: Sequence[float], *, of_robot: bool) -> list[float]:
+        signs = [one * other for one, other in product(self.signs, repeat=2)]
+        return [sign * value for sign, value in zip(signs, covariance, strict=True)]
+
+    def _transform(self, transform: Any, *, of_robot: bool, to_robot: bool) -> None:
+        self._vector(transform.translation, of_robot=of_robot)
+        self._rotation(transform.rotation, of_robot=of_robot)
+
+
+def _type(kind: Structure, name: str) -> Structure:
+    """Return the type of a field that is a message."""
+    found = dict(kind.fields)[name]
+    assert isinstance(found, Structure)
+    return found
+
+
+def _is_finite(part: Any) -> bool:
+    """Return whether all numbers of a position or an orientation are finite."""
+    return all(math.isfinite(getattr(part, name)) for name, _ in structure(type(part)).fields)
