@@ -67,6 +67,8 @@ class Guard:
         self.seen: dict[str, bool] | None = None
         """What was called while callbacks are observed, and whether it is one of a node. None: they are
         not."""
+        self.unlimited = False
+        """Whether callbacks may take as long as they like, because somebody debugs them."""
         self._profiler: Any = None
         self._main = threading.get_ident()
         self._closed = threading.Event()
@@ -86,6 +88,8 @@ class Guard:
         signal.signal(SIGNAL, self._previous)
 
     def _overdue(self) -> bool:
+        if self.unlimited:
+            return False
         return self.since is not None and time.monotonic() - self.since > self._patience
 
     def _watch(self) -> None:
@@ -103,6 +107,9 @@ class Guard:
     def _on_signal(self, _: int, frame: FrameType | None) -> None:
         if not self._overdue() or any(caller.f_code.co_name == '__del__' for caller in _stack(frame)):
             # An exception in __del__ would be lost. The next signal follows soon.
+            return
+        if debugger_is_active():
+            self.since = time.monotonic()
             return
         if self.seen is None:
             self.seen = {}
@@ -142,6 +149,13 @@ class Guard:
             f'callbacks without end: for {self._patience:g} s of wall time simulated time did not '
             f'advance, called: {"; ".join(seen) or "unknown"}'
         )
+
+
+def debugger_is_active() -> bool:
+    """Return whether a debugger follows this thread: pdb, or the one of an IDE."""
+    bdb = sys.modules.get('bdb')
+    followed = bdb is not None and isinstance(getattr(sys.gettrace(), '__self__', None), bdb.Bdb)
+    return followed or 'pydevd' in sys.modules
 
 
 def _stack(frame: FrameType | None) -> Iterator[FrameType]:

@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import os
 import threading
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import rclpy
@@ -28,6 +30,7 @@ from diffdrive_jacobian.lockstep._guard import Guard
 from diffdrive_jacobian.lockstep._injection import Fault, absolute_name
 from diffdrive_jacobian.lockstep._messaging import Messaging
 from diffdrive_jacobian.lockstep._nodes import Nodes
+from diffdrive_jacobian.lockstep._pause import pause
 from diffdrive_jacobian.lockstep._properties import Properties, Property
 from diffdrive_jacobian.lockstep._report import describe
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
@@ -144,7 +147,9 @@ class Lockstep:
         self._processes: list[NodeProcess] = []
         self._closing.callback(self._close_processes)
         self._time.processes = self._processes
-        self._extend = guard.extend
+        self._guard = guard
+        self.paused_as = 'the world'
+        self._time.pause = partial(pause, self)
         self._messaging = Messaging(scheduler, self._nodes, self._time, self.report)
         self._faults = Faults(scheduler, self._nodes, self.settle)
         self._properties = Properties(scheduler, self._nodes, self.report)
@@ -178,6 +183,11 @@ class Lockstep:
         """Destroy the nodes and shut rclpy down. Further calls have no effect."""
         if Lockstep._open is self:
             Lockstep._open = None
+            for time in self._time.pauses:
+                warnings.warn(
+                    f'pause_at({time / NANOSECONDS:g}): the world has ended at {self.world_seconds:g} s',
+                    stacklevel=2,
+                )
             self._closing.close()
 
     def _destroy_nodes(self) -> None:
@@ -371,6 +381,33 @@ class Lockstep:
             ValueError: `seconds` is zero or not finite, or the new time does not fit into a stamp.
         """
         self._time.jump(seconds)
+
+    def pause_at(self, seconds: float, what: str = 'the world') -> None:
+        """Stop in the debugger before a world time, when all that comes before it has happened.
+
+        `breakpoint()` is called. So the prompt of pdb, of pytest or of an IDE has this world as `world`:
+        `world.step()` lets the next things happen, `world.report()` and `world.last(topic)` tell what
+        has happened, `world.find(name)` returns a node. From now on nothing has a limit of wall time,
+        neither callbacks nor other processes, so they can be debugged, too.
+
+        Args:
+            seconds: World time since the start (s).
+            what: What this world is, for the message.
+
+        Raises:
+            ValueError: `seconds` is negative, has passed, or is too long.
+        """
+        self._check_open()
+        time = 0 if seconds == 0 else checked_nanoseconds('seconds', seconds)
+        if time < self.world_time:
+            raise ValueError(
+                f'seconds must not have passed: {self.world_seconds:g} s have, got {seconds!r}'
+            )
+        self._time.pauses = sorted([*self._time.pauses, time])
+        self.paused_as = what
+        self._guard.unlimited = True
+        for process in self._processes:
+            process.be_patient()
 
     # --- Messages and services
 
@@ -609,8 +646,10 @@ class Lockstep:
             without=without,
         )
         process = NodeProcess(
-            parameters, self._nodes, self._scheduler, self._extend, lambda: self.is_open
+            parameters, self._nodes, self._scheduler, self._guard.extend, lambda: self.is_open
         )
+        if self._guard.unlimited:
+            process.be_patient()
         process.start()
         self._processes.append(process)
         process.join()

@@ -45,7 +45,7 @@ from diffdrive_jacobian.ros.graph_faults import topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
-from diffdrive_jacobian.time_units import nanoseconds
+from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds, nanoseconds
 
 __all__ = ['GoToGoal']
 
@@ -149,6 +149,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             )
         if goal is not None and now == 0:
             raise MessageError(NO_CLOCK)
+        if state.stamp <= self._state.stamp and self._is_old(state, now):
+            return
         self._state = state
         if goal is None:
             return
@@ -176,6 +178,23 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._end(GoalStatus.STATUS_SUCCEEDED, f'reached{goal.pursuit.lateness(now)}')
             return
         self._publish_command(command, now)
+
+    def _is_old(self, state: State, now: int) -> bool:
+        """Return whether odometry that is not newer than the last comes again, or out of order.
+
+        Otherwise its source has no stamps, or has started again, or the clock was reset.
+        """
+        last = self._state.stamp
+        age = (last[0] - state.stamp[0]) * NANOSECONDS + last[1] - state.stamp[1]
+        in_future = last[0] * NANOSECONDS + last[1] > now
+        if state.stamp == (0, 0) or in_future or age > nanoseconds(self.parameters.odom_timeout):
+            return False
+        self.log_event_warning(
+            'odometry is old',
+            f'odometry on {self.resolve_topic_name("odom")} is ignored: its stamp is '
+            f'{in_seconds(age)} before the newest; does it come twice, or out of order?',
+        )
+        return True
 
     def _begin(self, goal: ActiveGoal, state: State) -> bool:
         """Start executing a goal, now that the frame of the odometry and the pose are known."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from diffdrive_jacobian.faults.fault import Fault, RosName
 from diffdrive_jacobian.lockstep._border import Endpoints
@@ -61,14 +61,17 @@ class Repeated(_Arrival):
 class Late(_Arrival):
     """The messages of a topic arrive late, by less than their period, and the same is said, later.
 
-    It is compared in the world without faults. Numbers must lie between those that were said in the
-    first world, from one `period` before to `seconds` and one period after.
+    What comes after them waits, so the order stays. It is compared in the world without faults. Numbers
+    must lie between those that were said in the first world, from one `period` before to `seconds` and
+    one period after.
 
     Attributes:
         seconds: Delay of each message (s).
         period: The longest period of the nodes under test and of what they hear (s). Whether a message
             comes before a timer or after it may move an event by so much.
     """
+
+    keeps_order: ClassVar[bool] = True
 
     seconds: Positive = 0.01
     period: Positive = field(default=0.1, kw_only=True)

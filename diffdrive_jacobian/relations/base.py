@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from diffdrive_jacobian.faults.fault import Expression, Fault
 from diffdrive_jacobian.lockstep._border import Endpoints
@@ -51,6 +51,9 @@ class Relation(Expression, ABC):
     def said(self, topic: str, message: Any) -> Any:
         """Return what a node under test must say instead of a message."""
         return self.image(topic, message)
+
+    keeps_order: ClassVar[bool] = False
+    """Whether what a node hears later waits for what comes late."""
 
     @property
     def early(self) -> float:

@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 
 from diffdrive_jacobian.faults import Fault
@@ -24,7 +25,7 @@ from diffdrive_jacobian.relations.differences import (
     exact,
     first_difference,
 )
-from diffdrive_jacobian.relations.perturbed import Perturbed, nearby
+from diffdrive_jacobian.relations.perturbed import Numbers, Perturbed, Stamps, nearby
 from diffdrive_jacobian.relations.whole_world import WholeWorld
 from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds, nanoseconds
 
@@ -95,6 +96,14 @@ class RelationViolation(PropertyViolation):
     """Hash of all messages of both worlds."""
 
 
+class Image(NamedTuple):
+    """What was said in the image of a world."""
+
+    ran: Ran
+    overtaken: int | None = None
+    """World time from which on the order of what was heard is another one (ns); None: it is the same."""
+
+
 class Checked(NamedTuple):
     """How the image of a world compares with it."""
 
@@ -110,6 +119,7 @@ class Checked(NamedTuple):
 
 
 UNTIL_ROUNDING = 'what came after an event that rounding decides was not compared'
+UNTIL_OVERTAKEN = 'what came after a request that overtook a late message was not compared'
 UNTIL_OTHERS = 'what came after a change of the other nodes was not compared'
 
 
@@ -127,46 +137,84 @@ def checked(relation: Relation, first: Ran, scene: Scene) -> Checked:
     names = relation.under_test(first.nodes, first.namespace)
     image = _image_of(relation, first, scene, names)
     result = _compared(relation, first, image, names)
-    seconds = image.end / NANOSECONDS
+    seconds = image.ran.end / NANOSECONDS
     if result.difference is None:
         return result._replace(seconds=seconds)
     # Between messages that are late rounding decides nothing.
-    for near in () if relation.late else nearby(relation.tolerance):
+    kind = Stamps if isinstance(relation, WholeWorld) else Numbers
+    for near in () if relation.late else nearby(kind, relation.tolerance):
         other = _image_of(near, first, scene, names)
-        seconds += other.end / NANOSECONDS
+        seconds += other.ran.end / NANOSECONDS
         moved = _compared(near, first, other, names).difference
         if moved is not None and moved.time <= result.difference.time:
             # Where a change of 1e-9 changes what is said, rounding may, too.
             return result._replace(difference=None, note=UNTIL_ROUNDING, seconds=seconds)
-    return result._replace(seconds=seconds, digest=_digest(first, image))
+    return result._replace(seconds=seconds, digest=_digest(first, image.ran))
 
 
-def _image_of(relation: Relation | Perturbed, first: Ran, scene: Scene, names: Collection[str]) -> Ran:
+def _image_of(relation: Relation | Perturbed, first: Ran, scene: Scene, names: Collection[str]) -> Image:
+    """Run the image of a world."""
     if isinstance(relation, WholeWorld):
-        return scene.run('the image', args=relation.args, later=relation.start)
+        return Image(scene.run('the image', args=relation.args, later=relation.start))
+    hearings: list[_Hearing] = []
 
-    failed: list[LockstepError] = []
+    def listen(world: Lockstep) -> Border:
+        hearings.append(_Hearing(relation, world, names))
+        return Border(world, first.messages, names, hearings[0])
 
-    def heard(link: Link, data: bytes) -> list[tuple[int, bytes]]:
+    ran = scene.run('the image', listen)
+    (hearing,) = hearings
+    if hearing.failed is not None:
+        raise hearing.failed
+    return Image(ran, hearing.overtaken)
+
+
+class _Hearing:
+    """What the nodes under test hear in an image."""
+
+    def __init__(self, relation: Relation | Perturbed, world: Lockstep, names: Collection[str]) -> None:
+        self._relation, self._world, self._names = relation, world, names
+        self.failed: LockstepError | None = None
+        """Why an image could not be made. Not an error of the node that hears it."""
+        self.overtaken: int | None = None
+        """World time at which a request has overtaken a message that is late (ns); None: none has."""
+        self._until: dict[Node, int] = {}
+        self._services: set[str] = set()
+        if isinstance(relation, Perturbed):
+            relation.world = world
+        if relation.keeps_order:
+            world.on_new_topics(self._look_for_services)
+
+    def __call__(self, link: Link, data: bytes) -> list[tuple[int, bytes]]:
+        """Return what is heard instead of a message, with delays (ns)."""
         try:
             message = deserialize_message(data, link.message_type)
         except RuntimeError:
             # Bytes that are no message have no image.
             return [(0, data)]
         try:
-            return [
-                (nanoseconds(delay), serialize_message(one))
-                for delay, one in _images(relation, link.topic, message, relation.heard)
-            ]
+            images = _images(self._relation, link.topic, message, self._relation.heard)
+            out = [(nanoseconds(delay), serialize_message(one)) for delay, one in images]
         except LockstepError as error:
-            # Not an error of the node that hears it.
-            failed.append(error)
+            self.failed = error
             raise
+        if self._relation.keeps_order:
+            now = self._world.world_time
+            out = [(max(delay, self._until.get(link.owner, 0) - now), one) for delay, one in out]
+            self._until[link.owner] = now + max(delay for delay, _ in out)
+        return out
 
-    image = scene.run('the image', lambda world: Border(world, first.messages, names, heard))
-    if failed:
-        raise failed[0]
-    return image
+    def _look_for_services(self) -> None:
+        for node in self._world.nodes:
+            if node.get_fully_qualified_name() in self._names:
+                for service in node.services:
+                    if service.service_name not in self._services:
+                        self._services.add(service.service_name)
+                        self._world.on_response(service.service_name, self._on_response)
+
+    def _on_response(self, node: Node, _: Any) -> None:
+        if self.overtaken is None and self._until.get(node, 0) > self._world.world_time:
+            self.overtaken = self._world.world_time
 
 
 def _images(relation: Any, topic: str, message: Any, image_of: Callable[[str, Any], Any]) -> Any:
@@ -190,10 +238,14 @@ def _images(relation: Any, topic: str, message: Any, image_of: Callable[[str, An
     return images
 
 
-def _compared(relation: Relation | Perturbed, first: Ran, image: Ran, names: Collection[str]) -> Checked:
+def _compared(
+    relation: Relation | Perturbed, first: Ran, image_of: Image, names: Collection[str]
+) -> Checked:
     """Compare what nodes said with the image of what they had said."""
-    end = min(first.end, image.end) + 1
-    note = ''
+    image = image_of.ran
+    end, note = min(first.end, image.end) + 1, ''
+    if image_of.overtaken is not None:
+        end, note = image_of.overtaken, UNTIL_OVERTAKEN
     if not isinstance(relation, WholeWorld):
         others = _change_of_others(first, image, names, relation.tolerance)
         if others < end:
@@ -213,6 +265,7 @@ def _compared(relation: Relation | Perturbed, first: Ran, image: Ran, names: Col
             expected.get(speaker, ()),
             actual.get(speaker, ()),
             tolerance=relation.tolerance,
+            end=end,
             early=relation.early,
             late=relation.late,
             period=relation.period if isinstance(relation, WholeWorld) else 0.0,

@@ -147,6 +147,7 @@ def first_difference(
     image: Sequence[Spoken],
     *,
     tolerance: float,
+    end: int,
     early: float = 0.0,
     late: float = 0.0,
     period: float = 0.0,
@@ -160,6 +161,7 @@ def first_difference(
         expected: The images of what it has said.
         image: What it said in the image.
         tolerance: Largest difference of numbers.
+        end: Time at which both were last listened to (ns).
         early: How much earlier the image may say something (s).
         late: How much later (s).
         period: How far an event may be moved (s), after which nothing is compared.
@@ -167,7 +169,7 @@ def first_difference(
     expected, image = _once(expected, tolerance), _once(image, tolerance)
     if early or late:
         window = round(early * NANOSECONDS), round(late * NANOSECONDS)
-        return _outside(speaker, expected, image, tolerance, *window), None
+        return _outside(speaker, expected, image, tolerance, *window, end), None
     for index, (old, new) in enumerate(zip_longest(expected, image)):
         if old is not None and new is not None and old.time == new.time:
             differences = differing(new.message, old.message, tolerance)
@@ -226,14 +228,19 @@ def _outside(
     tolerance: float,
     early: int,
     late: int,
+    end: int,
 ) -> Difference | None:
     """Return the first message that lies outside of those of the other world around its time."""
     found = []
     for one in image:
+        if one.time + early >= end:
+            break
         near = [two for two in expected if one.time - late <= two.time <= one.time + early]
         if text := _not_between(one, near, tolerance, early + late):
             found.append(Difference(one.time, f'{text} around this time'))
     for one in expected:
+        if one.time + late >= end:
+            break
         near = [two for two in image if one.time - early <= two.time <= one.time + late]
         if text := _not_between(one, near, tolerance, early + late):
             found.append(Difference(one.time, f'{text} in the image around this time'))

@@ -19,7 +19,7 @@ SYNCHRONOUS = {'RMW_FASTRTPS_PUBLICATION_MODE': 'SYNCHRONOUS'}
 """Environment of processes: a thread of Fast DDS would publish later what is published at once."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Command:
     """How a process is started: the arguments of `Lockstep.start`."""
 

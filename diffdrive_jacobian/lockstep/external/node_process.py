@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 from rclpy.node import Node
 
+from diffdrive_jacobian.lockstep._clock import MAX_SECONDS
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._link import Link, Stage
 from diffdrive_jacobian.lockstep._nodes import Nodes
@@ -147,6 +148,10 @@ class NodeProcess:
         self._do_not_restart()
         self._kill()
         self._scheduler.forget_destroyed()
+
+    def be_patient(self) -> None:
+        """Wait for it as long as it takes: somebody debugs it."""
+        self._command.patience = self._command.timeout = float(MAX_SECONDS)
 
     # --- Start
 

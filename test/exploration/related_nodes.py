@@ -1,0 +1,97 @@
+"""Worlds in which our own controller is compared with its images: to goals, and along paths.
+
+`test/benchmark/relations.py` runs a thousand of each.
+"""
+
+from __future__ import annotations
+
+from geometry_msgs.msg import PoseStamped
+from hypothesis import strategies as st
+from nav_msgs.msg import Path
+from std_srvs.srv import Trigger
+from support.lockstep_nodes import make
+from support.ros_messages import goal, path
+
+from diffdrive_jacobian import faults
+from diffdrive_jacobian.messages.conversion import set_time
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.relations import Late, Mirrored, Moved, Renamed, Repeated, Shifted
+from diffdrive_jacobian.testing import fault_schedules, goals, numbers, points, poses
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+LAWS = ('pure_pursuit', 'kanayama', 'offset_point', 'dynamic_feedback')
+DISTURBED = 4.0
+"""Time at which the last fault has ended (s)."""
+RATE = 20.0
+"""Rate of the odometry (Hz)."""
+END = 6.0
+"""End of a world (s)."""
+KINDS = (
+    *(faults.Loss, faults.Delay, faults.Stale, faults.Duplicate, faults.Reorder, faults.RateLimit),
+    *(faults.Hang, faults.Kill, faults.Slow, faults.TimerJitter, faults.ClockPause, faults.TimeJump),
+)
+RELATIONS = (
+    *(Moved(), Mirrored(), Shifted(), Renamed()),
+    *(Repeated('odom'), Repeated('odom', after=0.12), Late('odom')),
+)
+
+
+def send(world, topic, kind, message):
+    """Publish a message with a stamp, whether or not anybody listens."""
+    publishers = {one.topic_name: one for one in world.node.publishers}
+    publisher = publishers.get(world.node.resolve_topic_name(topic))
+    set_time(message.header.stamp, world.now)
+    (publisher or world.node.create_publisher(kind, topic, 10)).publish(message)
+    world.settle()
+
+
+def driven(world, case):
+    """Send goals, or a path, to go_to_goal, and cancel them."""
+    x, y, theta = map(float, case['start'])
+    world.create(lambda: make(VirtualRobot, publish_rate=RATE, x=x, y=y, theta=theta))
+    law = {} if case['law'] is None else {'path_controller': case['law']}
+    world.create(lambda: make(GoToGoal, **law))
+    cancel = world.node.create_client(Trigger, 'cancel_goal')
+
+    def drive(what):
+        if case['law'] is None:
+            send(world, 'goal_pose', PoseStamped, goal(*map(float, what)))
+        else:
+            places = [(x + float(dx), y + float(dy)) for dx, dy in what]
+            send(world, 'path', Path, path(*places))
+
+    events = [(time, lambda what=what: drive(what)) for time, what in case['goals']]
+    if case['cancel'] is not None:
+        events.append((case['cancel'], lambda: cancel.call_async(Trigger.Request())))
+    for time, act in [*sorted(events, key=lambda event: event[0]), (END, world.settle)]:
+        left = time - world.world_time / NANOSECONDS
+        if left > 0.0:
+            world.run_for(left)
+        act()
+    world.settle()
+
+
+def cases(law):
+    """Return the strategies of the cases of a path law; None: goals."""
+    times = numbers(0.0, 3.0)
+    along = st.lists(points(1.0), min_size=2, max_size=5, unique=True)
+    what = goals(1.0) if law is None else along
+    return {
+        'law': st.just(law),
+        'start': poses(1.0),
+        'goals': st.lists(st.tuples(times, what), min_size=1, max_size=2),
+        'cancel': st.one_of(st.none(), st.none(), times),
+    }
+
+
+def schedules():
+    """Return the strategy of the fault schedules."""
+    return fault_schedules(
+        topics=['odom', 'goal_pose', 'path', 'cmd_vel'],
+        nodes=['go_to_goal', 'virtual_robot'],
+        services=['cancel_goal'],
+        kinds=KINDS,
+        duration=DISTURBED,
+        max_faults=2,
+    )
