@@ -31,6 +31,7 @@ from diffdrive_jacobian.exploration.result import Exploration, Finding
 from diffdrive_jacobian.exploration.scenario import ExplorationError, Scenario, ScenarioName, Source
 from diffdrive_jacobian.exploration.schedules import StopShrinking, generate, shrink, st, trials
 from diffdrive_jacobian.exploration.trial import Outcome, Setting, Trial, Violation
+from diffdrive_jacobian.exploration.unseen import Summary
 from diffdrive_jacobian.numerics.checks import integer, number, positive_or_infinite
 from diffdrive_jacobian.properties.base import Property
 from diffdrive_jacobian.relations.base import Relation
@@ -219,6 +220,7 @@ class Search:
     """Outcomes of blocks that will be run again, by the keys of their trials."""
     worlds: int = 0
     faults: int = 0
+    summary: Summary = field(default_factory=Summary)
     checks: int = 0
     compared: Counter[str] = field(default_factory=Counter)
     """By relation."""
@@ -268,6 +270,7 @@ class Search:
             checks=self.checks,
             compared=self.compared.total(),
             stopped=self.stopped,
+            unseen=self.summary.unseen(self.worlds, self.faults),
             notes=(
                 *(f'{one}: nothing was compared' for one, count in self.compared.items() if not count),
                 *(
@@ -333,6 +336,7 @@ class Search:
         self.worlds += 1
         self.faults += len(one.trial.faults)
         self.checks += outcome.checks
+        self.summary.add(outcome.seen, outcome.compared_topics)
         self.compared.update(outcome.compared)
         self.simulated += outcome.seconds
         if outcome.complaints and not one.trial.faults:

@@ -24,6 +24,7 @@ from diffdrive_jacobian.exploration.trial import (
     Violation,
     of_exception,
 )
+from diffdrive_jacobian.exploration.unseen import Unseen
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.text import printable
 
@@ -159,6 +160,8 @@ class Exploration:
     """Number of messages that were compared with their images."""
     stopped: str = ''
     """Why not all worlds ran; empty: they did."""
+    unseen: Unseen = field(default_factory=Unseen)
+    """What no world has touched."""
     notes: tuple[str, ...] = ()
     """What went wrong in worlds without being a finding."""
 
@@ -212,6 +215,8 @@ class Exploration:
         lines += [f'note: {note}' for note in self.notes[:NOTED]]
         if len(self.notes) > NOTED:
             lines.append(f'note: and {len(self.notes) - NOTED} more notes')
+        if unseen := str(self.unseen):
+            lines.append(f'not seen in any world:\n{unseen}')
         return '\n\n'.join(['\n'.join(lines), *map(str, self.findings)])
 
 

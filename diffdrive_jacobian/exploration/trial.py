@@ -18,6 +18,7 @@ from rclpy.serialization import deserialize_message
 
 import diffdrive_jacobian
 from diffdrive_jacobian.exploration.scenario import ScenarioName
+from diffdrive_jacobian.exploration.unseen import Seen, Watcher
 from diffdrive_jacobian.faults import Fault
 from diffdrive_jacobian.faults.fault import Expression
 from diffdrive_jacobian.lockstep._border import Said
@@ -117,6 +118,10 @@ class Outcome:
     """What faults, a property or a relation needed and did not find."""
     notes: tuple[str, ...] = ()
     """What relations did not compare."""
+    seen: Seen = field(default_factory=Seen)
+    """What the world has had."""
+    compared_topics: frozenset[str] = frozenset()
+    """Topics whose messages were compared with their images."""
     digest: str = ''
     """Hash of all messages, if it was asked for."""
 
@@ -208,6 +213,7 @@ def run(
             MessageDigest(world) if digest else nullcontext()
         )
         with hashed as messages:
+            watcher = Watcher(world)
             world.inject(*trial.faults, seed=trial.seed)
             world.require(*properties)
             first: Ran | None = None
@@ -231,6 +237,7 @@ def run(
             seconds=world.world_seconds,
             complaints=complaints,
             digest='' if messages is None else messages.value(),
+            seen=watcher.seen(trial.faults),
         )
     if first is None:
         return outcome
@@ -262,6 +269,7 @@ def _with_images(
             outcome,
             compared={**outcome.compared, repr(relation): result.compared},
             seconds=outcome.seconds + result.seconds,
+            compared_topics=outcome.compared_topics | result.topics,
             notes=(*outcome.notes, *([f'{relation!r}: {result.note}'] if result.note else ())),
         )
         if result.difference is not None:

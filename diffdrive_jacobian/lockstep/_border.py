@@ -57,6 +57,21 @@ class Endpoints:
     subscribed: set[str] = field(default_factory=set)
 
 
+def endpoints_of(world: Lockstep) -> dict[str, Endpoints]:
+    """Return the nodes of a world by their full names, without those of the test. More may follow."""
+    found: dict[str, Endpoints] = {}
+
+    def look() -> None:
+        for node in world.nodes:
+            if node not in world._nodes.observers:
+                endpoints = found.setdefault(node.get_fully_qualified_name(), Endpoints())
+                endpoints.published.update(one.topic_name for one in node.publishers)
+                endpoints.subscribed.update(one.topic_name for one in node.subscriptions)
+
+    world.on_new_topics(look)
+    return found
+
+
 class Said:
     """What all nodes of a world say while this context manager is open."""
 
@@ -66,10 +81,9 @@ class Said:
         self._scheduler = world._scheduler
         self.messages: list[Message] = []
         """In the order in which they were sent."""
-        self.nodes: dict[str, Endpoints] = {}
+        self.nodes = endpoints_of(world)
         """All nodes that there were, by their full names, without those that belong to the test."""
         self._speakers: dict[Publisher, Speaker | None] = {}
-        world.on_new_topics(self._note_nodes)
 
     def __enter__(self) -> Said:
         """Start to listen."""
@@ -101,13 +115,6 @@ class Said:
             data = msg if isinstance(msg, bytes) else serialize_message(msg)
             message = Message(self._scheduler.agenda.now, speaker, publisher.msg_type, data)
             self.messages.append(message)
-
-    def _note_nodes(self) -> None:
-        for node in self._scheduler.nodes:
-            if node not in self._world._nodes.observers:
-                endpoints = self.nodes.setdefault(node.get_fully_qualified_name(), Endpoints())
-                endpoints.published.update(one.topic_name for one in node.publishers)
-                endpoints.subscribed.update(one.topic_name for one in node.subscriptions)
 
     def _speaker(self, publisher: Publisher) -> Speaker | None:
         """Return who publishes; None: the world itself, or rclpy."""

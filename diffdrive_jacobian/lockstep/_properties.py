@@ -83,6 +83,8 @@ class Properties:
         self._report = report
         self.required: list[_Required] = []
         """What is required now."""
+        self.observed: set[str] = set()
+        """Full names of the topics that properties have observed."""
         self._offered: set[str] = set()
         self._expected: list[tuple[Property, tuple[str, ...]]] = []
         self._requiring: Property | None = None
@@ -150,12 +152,14 @@ class Properties:
     def on_published(self, topic: str, observe: Published) -> str:
         """Observe what is published, as `Lockstep.on_published`."""
         name = str(self._nodes.own.resolve_topic_name(topic))
+        self.observed.add(name)
         self._observe(self._scheduler.links.observers_of_published(name), observe)
         return name
 
     def on_delivered(self, topic: str, observe: Delivered) -> str:
         """Observe what is received, as `Lockstep.on_delivered`."""
         name = str(self._nodes.own.resolve_topic_name(topic))
+        self.observed.add(name)
         self._observe(self._scheduler.links.observers_of_delivered(name), observe)
         return name
 

@@ -110,6 +110,8 @@ class Checked(NamedTuple):
     difference: Difference | None
     compared: int = 0
     """Number of messages that were compared."""
+    topics: frozenset[str] = frozenset()
+    """Their topics, as in the first world."""
     seconds: float = 0.0
     """Simulated time of the worlds that were run (s)."""
     note: str = ''
@@ -119,7 +121,7 @@ class Checked(NamedTuple):
 
 
 UNTIL_ROUNDING = 'what came after an event that rounding decides was not compared'
-UNTIL_OVERTAKEN = 'what came after a request that overtook a late message was not compared'
+UNTIL_OVERTAKEN = 'what came after a request or an end that overtook a late message was not compared'
 UNTIL_OTHERS = 'what came after a change of the other nodes was not compared'
 
 
@@ -177,13 +179,13 @@ class _Hearing:
         self.failed: LockstepError | None = None
         """Why an image could not be made. Not an error of the node that hears it."""
         self.overtaken: int | None = None
-        """World time at which a request has overtaken a message that is late (ns); None: none has."""
+        """World time at which a request or the end of a node overtook what is late (ns); None: never."""
         self._until: dict[Node, int] = {}
         self._services: set[str] = set()
         if isinstance(relation, Perturbed):
             relation.world = world
         if relation.keeps_order:
-            world.on_new_topics(self._look_for_services)
+            world.on_new_topics(self._look)
 
     def __call__(self, link: Link, data: bytes) -> list[tuple[int, bytes]]:
         """Return what is heard instead of a message, with delays (ns)."""
@@ -204,8 +206,12 @@ class _Hearing:
             self._until[link.owner] = now + max(delay for delay, _ in out)
         return out
 
-    def _look_for_services(self) -> None:
-        for node in self._world.nodes:
+    def _look(self) -> None:
+        nodes = self._world.nodes
+        for node in self._until.keys() - nodes:
+            # A node that is destroyed does not hear what is late.
+            self._note_overtaking(node)
+        for node in nodes:
             if node.get_fully_qualified_name() in self._names:
                 for service in node.services:
                     if service.service_name not in self._services:
@@ -213,6 +219,9 @@ class _Hearing:
                         self._world.on_response(service.service_name, self._on_response)
 
     def _on_response(self, node: Node, _: Any) -> None:
+        self._note_overtaking(node)
+
+    def _note_overtaking(self, node: Node) -> None:
         if self.overtaken is None and self._until.get(node, 0) > self._world.world_time:
             self.overtaken = self._world.world_time
 
@@ -276,9 +285,9 @@ def _compared(
             end, note = until, UNTIL_ROUNDING
     found = [one for one in found if one.time < end]
     count = sum(one.time < end for spoken in expected.values() for one in spoken)
-    if not found:
-        return Checked(None, count, note=note)
-    return Checked(min(found, key=lambda difference: difference.time), count, note=note)
+    topics = {one.speaker.topic for one in first.messages if one.speaker.node in names}
+    difference = min(found, key=lambda difference: difference.time, default=None)
+    return Checked(difference, count, frozenset(topics), note=note)
 
 
 def _spoken(

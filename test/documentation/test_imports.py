@@ -22,7 +22,7 @@ LAYERS = (
     *('numerics', 'kinematics', 'control', 'simulation'),
     *('messages', 'parameters', 'bags', 'calibration', 'plots'),
     *('ros', 'nodes', 'diagnosis', 'recording', 'lockstep', 'faults', 'properties'),
-    *('exploration', 'drives'),
+    *('relations', 'exploration', 'drives'),
     *('testing', 'robot_testing', 'live', 'tools'),
 )
 PURE = LAYERS[:4]
