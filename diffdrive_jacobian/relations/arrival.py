@@ -71,6 +71,7 @@ class Late(_Arrival):
             comes before a timer or after it may move an event by so much.
     """
 
+    perturbed: ClassVar[None] = None
     keeps_order: ClassVar[bool] = True
 
     seconds: Positive = 0.01

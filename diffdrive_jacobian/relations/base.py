@@ -12,6 +12,7 @@ from diffdrive_jacobian.lockstep._border import Endpoints
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.numerics.checks import Positive
+from diffdrive_jacobian.relations.perturbed import Numbers, Perturbed
 
 TOLERANCE = 1e-6
 """Default tolerance of numbers, relative to those above 1."""
@@ -52,6 +53,8 @@ class Relation(Expression, ABC):
         """Return what a node under test must say instead of a message."""
         return self.image(topic, message)
 
+    perturbed: ClassVar[type[Perturbed] | None] = Numbers
+    """What a change of shows whether rounding decides; None: nothing is rounded otherwise."""
     keeps_order: ClassVar[bool] = False
     """Whether what a node hears later waits for what comes late."""
 

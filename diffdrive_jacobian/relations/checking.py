@@ -25,7 +25,7 @@ from diffdrive_jacobian.relations.differences import (
     exact,
     first_difference,
 )
-from diffdrive_jacobian.relations.perturbed import Numbers, Perturbed, Stamps, nearby
+from diffdrive_jacobian.relations.perturbed import Perturbed, nearby
 from diffdrive_jacobian.relations.whole_world import WholeWorld
 from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds, nanoseconds
 
@@ -142,9 +142,10 @@ def checked(relation: Relation, first: Ran, scene: Scene) -> Checked:
     seconds = image.ran.end / NANOSECONDS
     if result.difference is None:
         return result._replace(seconds=seconds)
-    # Between messages that are late rounding decides nothing.
-    kind = Stamps if isinstance(relation, WholeWorld) else Numbers
-    for near in () if relation.late else nearby(kind, relation.tolerance):
+    # Of all nodes that of the difference, so that the others keep their order.
+    speaker = result.difference.speaker
+    names = names if speaker is None else {speaker.node}
+    for near in nearby(relation.perturbed, relation.tolerance) if relation.perturbed else ():
         other = _image_of(near, first, scene, names)
         seconds += other.ran.end / NANOSECONDS
         moved = _compared(near, first, other, names).difference
@@ -286,8 +287,17 @@ def _compared(
     found = [one for one in found if one.time < end]
     count = sum(one.time < end for spoken in expected.values() for one in spoken)
     topics = {one.speaker.topic for one in first.messages if one.speaker.node in names}
-    difference = min(found, key=lambda difference: difference.time, default=None)
-    return Checked(difference, count, frozenset(topics), note=note)
+    return Checked(_first(found, image), count, frozenset(topics), note=note)
+
+
+def _first(found: Sequence[Difference], image: Ran) -> Difference | None:
+    """Return the first difference; of those at one time that which was said first."""
+    if not found:
+        return None
+    time = min(one.time for one in found)
+    order: list[Speaker | None] = [one.speaker for one in image.messages if one.time == time]
+    same = [one for one in found if one.time == time]
+    return min(same, key=lambda one: [*order, one.speaker].index(one.speaker))
 
 
 def _spoken(
@@ -403,12 +413,10 @@ def check_relation(
         raise first.error
     result = checked(relation, first, scene)
     if result.difference is not None:
-        time, text = result.difference
+        time, text, _ = result.difference
         violation = RelationViolation(relation, time / NANOSECONDS, text)
         violation.digest = result.digest
         raise violation
     if not result.compared:
-        raise LockstepError(
-            f'{relation!r}: nothing was compared, because the nodes under test said nothing until '
-            f'{in_seconds(first.end)}'
-        )
+        why = result.note or f'the nodes under test said nothing until {in_seconds(first.end)}'
+        raise LockstepError(f'{relation!r}: nothing was compared: {why}')

@@ -44,6 +44,8 @@ class Difference(NamedTuple):
     time: int
     """World time (ns)."""
     text: str
+    speaker: Speaker | None = None
+    """The publisher; None: the image has ended by an error."""
 
 
 # --- Messages
@@ -185,7 +187,7 @@ def first_difference(
             new, expected[index:], time, period, tolerance
         ):
             return None, time
-        return Difference(time, f'{speaker.node} on {speaker.topic}: {text}'), None
+        return Difference(time, f'{speaker.node} on {speaker.topic}: {text}', speaker), None
     return None, None
 
 
@@ -247,7 +249,8 @@ def _outside(
     if not found:
         return None
     first = min(found, key=lambda difference: difference.time)
-    return first._replace(text=f'{speaker.node} on {speaker.topic}: {first.text}')
+    text = f'{speaker.node} on {speaker.topic}: {first.text}'
+    return Difference(first.time, text, speaker)
 
 
 def _not_between(one: Spoken, near: Sequence[Spoken], tolerance: float, late: int) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
@@ -15,6 +15,7 @@ from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.structure import Text, parts
 from diffdrive_jacobian.numerics.checks import Positive, nonempty
 from diffdrive_jacobian.relations.base import Relation
+from diffdrive_jacobian.relations.perturbed import Perturbed, Stamps
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
 GLOBAL = ('/tf', '/tf_static')
@@ -25,6 +26,8 @@ TIME = 'builtin_interfaces/Time'
 @dataclass(frozen=True, repr=False)
 class WholeWorld(Relation):
     """All nodes are under test, with the world in which they are. Base class."""
+
+    perturbed: ClassVar[type[Perturbed] | None] = None
 
     @property
     def start(self) -> float:
@@ -67,6 +70,8 @@ class Shifted(WholeWorld):
         period: The longest period of the timers (s). From the first event on that is moved by up to this
             time, nothing is compared.
     """
+
+    perturbed: ClassVar[type[Perturbed]] = Stamps
 
     seconds: Positive = 1000.0
     period: Positive = field(default=0.1, kw_only=True)

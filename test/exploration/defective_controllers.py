@@ -1,8 +1,9 @@
-"""Twelve controllers with one defect each, as students write them, and the one without a defect.
+"""Controllers with one defect each, as students write them, and the one without a defect.
 
 `Controller` drives to the goals of `goal_pose` by the odometry. It publishes `cmd_vel` and
 `goal_status`, and has the service `cancel_goal`. Each of the others overrides what its author got wrong.
-`PROPERTIES` and `drive` are what a tester requires who does not know the defects: the same of all.
+`PROPERTIES`, `RELATIONS` and `drive` are what a tester requires who does not know the defects: the same
+of all. The twelve of `DEFECTIVE` violate a property, the four of `ARRIVING` only relations.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import math
 from functools import partial
 
+import numpy as np
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
@@ -35,6 +37,7 @@ from diffdrive_jacobian.properties import (
     StopsOnShutdown,
     end_of_faults,
 )
+from diffdrive_jacobian.relations import Late, Mirrored, Moved, Renamed, Repeated, Shifted
 
 MAX_V, MAX_OMEGA = 1.0, 3.0
 """Largest commands (m/s, rad/s)."""
@@ -334,6 +337,34 @@ class OverflowsAtPi(Controller):
         return angle
 
 
+class WrapsBelowOnly(Controller):
+    """Angles above a half turn stay."""
+
+    def wrap(self, angle):
+        return angle + math.tau if angle < -math.pi else angle
+
+
+class OldOdometry(Controller):
+    """Odometry may come again, or out of order."""
+
+    def is_fresh(self, stamp, now):
+        return 0.0 <= now - stamp <= LONGEST_AGE
+
+
+class SinglePrecision(Controller):
+    """The time of the last command is kept as float32."""
+
+    def step(self, now):
+        return super().step(float(np.float32(now)))
+
+
+class AbsoluteNames(Controller):
+    """Who drives the robot is in no namespace."""
+
+    def create_publisher(self, kind, topic, *args, **kwargs):
+        return super().create_publisher(kind, f'/{topic.lstrip("/")}', *args, **kwargs)
+
+
 DEFECTIVE = {
     'no odometry timeout': NoOdometryTimeout,
     'wrong wrap of angles': WrongWrap,
@@ -348,7 +379,13 @@ DEFECTIVE = {
     'trusts stamps': TrustsStamps,
     'overflows at pi': OverflowsAtPi,
 }
-CONTROLLERS = {'no defect': Controller, **DEFECTIVE}
+ARRIVING = {
+    'wraps angles below -pi only': WrapsBelowOnly,
+    'uses old odometry': OldOdometry,
+    'time in single precision': SinglePrecision,
+    'absolute names': AbsoluteNames,
+}
+CONTROLLERS = {'no defect': Controller, **DEFECTIVE, **ARRIVING}
 
 
 # --- What is required of them
@@ -370,6 +407,11 @@ PROPERTIES = (
     KeepsDriving(2.0, tolerance=0.1),
     PoseFinite(),
     StaysWithin((-10.0, 10.0), (-10.0, 10.0)),
+)
+
+RELATIONS = (
+    *(Moved(), Mirrored(), Shifted(), Renamed(), Late('odom')),
+    *(Repeated('odom'), Repeated('odom', after=0.12), Repeated('goal_pose')),
 )
 
 
