@@ -39,7 +39,8 @@ from diffdrive_jacobian.messages.structure import (
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.properties.base import Property
 from diffdrive_jacobian.relations.base import Relation
-from diffdrive_jacobian.relations.checking import Ran, Scene, checked
+from diffdrive_jacobian.relations.checking import checked
+from diffdrive_jacobian.relations.worlds import Ran, Scene
 from diffdrive_jacobian.ros.rclpy_internals import wrap_publish
 from diffdrive_jacobian.text import error_text, printable_lines
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -221,6 +222,9 @@ def run(
                 ended: BaseException | None = None
                 try:
                     scenario(world, trial.case)
+                    if relations:
+                        # As in the images.
+                        world.settle()
                     complaints = _finish(world)
                 except KeyboardInterrupt:
                     raise

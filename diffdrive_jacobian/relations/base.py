@@ -12,6 +12,7 @@ from diffdrive_jacobian.lockstep._border import Endpoints
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.numerics.checks import Positive
+from diffdrive_jacobian.relations.imaging import Imaging
 from diffdrive_jacobian.relations.perturbed import Numbers, Perturbed
 
 TOLERANCE = 1e-6
@@ -19,7 +20,7 @@ TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, repr=False)
-class Relation(Expression, ABC):
+class Relation(Imaging, Expression, ABC):
     """What nodes say must be the image of what they said, if they hear the image of what they heard.
 
     The nodes under test are run again in the same world. They hear the images of the same messages, and
@@ -35,6 +36,9 @@ class Relation(Expression, ABC):
 
     node: str = field(default='', kw_only=True)
     tolerance: Positive = field(default=TOLERANCE, kw_only=True)
+
+    perturbed: ClassVar[type[Perturbed] | None] = Numbers
+    """What shows whether rounding decides, if it is changed; None: nothing is rounded otherwise."""
 
     @abstractmethod
     def image(self, topic: str, message: Any) -> Any:
@@ -52,21 +56,6 @@ class Relation(Expression, ABC):
     def said(self, topic: str, message: Any) -> Any:
         """Return what a node under test must say instead of a message."""
         return self.image(topic, message)
-
-    perturbed: ClassVar[type[Perturbed] | None] = Numbers
-    """What a change of shows whether rounding decides; None: nothing is rounded otherwise."""
-    keeps_order: ClassVar[bool] = False
-    """Whether what a node hears later waits for what comes late."""
-
-    @property
-    def early(self) -> float:
-        """How much earlier the image may say something (s)."""
-        return 0.0
-
-    @property
-    def late(self) -> float:
-        """How much later the image may say something (s)."""
-        return 0.0
 
     def is_disturbed_by(self, fault: Fault) -> bool:
         """Return whether it need not hold with a fault. Both worlds are without it then."""

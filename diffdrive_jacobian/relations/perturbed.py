@@ -5,11 +5,12 @@ from __future__ import annotations
 import random
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any
 
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.structure import Array, Number, Sequence, Structure, is_stamp, parts
+from diffdrive_jacobian.relations.imaging import Imaging
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 PAIRS = 2
@@ -18,29 +19,24 @@ AMPLITUDES = {'d': 1e-9, 'f': 1e-7}
 """Changes of numbers, relative to those above 1, by the code of their type."""
 
 
-class Perturbed(ABC):
+class Perturbed(Imaging, ABC):
     """What the nodes under test hear is changed a little, and they must say the same. Base class."""
-
-    early: ClassVar[float] = 0.0
-    late: ClassVar[float] = 0.0
-    keeps_order: ClassVar[bool] = False
 
     def __init__(self, seed: int, sign: int, tolerance: float) -> None:
         """Start with random numbers from a seed, each multiplied by a sign."""
         self._random, self._sign = random.Random(seed), sign
         self.tolerance = tolerance
-        self.world: Lockstep
-        """The world in which it is heard."""
+        self._world: Lockstep
+
+    def begin(self, world: Lockstep) -> None:
+        """Begin in a world."""
+        self._world = world
 
     def heard(self, topic: str, message: Any) -> list[tuple[float, Any]]:
         """Return the changed message."""
         for kind, part in parts(message):
             self._change(kind, part)
         return [(0.0, message)]
-
-    def said(self, topic: str, message: Any) -> Any:
-        """Return the message."""
-        return message
 
     @abstractmethod
     def _change(self, kind: Structure, part: Any) -> None:
@@ -73,7 +69,7 @@ class Stamps(Perturbed):
         # Zero: there is none.
         if time:
             moved = time + self._sign * self._random.choice((-1, 1))
-            set_time(part, min(moved, max(time, self.world.now)))
+            set_time(part, min(moved, max(time, self._world.now)))
 
 
 def nearby(kind: type[Perturbed], tolerance: float) -> Iterator[Perturbed]:

@@ -28,33 +28,11 @@ class WholeWorld(Relation):
     """All nodes are under test, with the world in which they are. Base class."""
 
     perturbed: ClassVar[type[Perturbed] | None] = None
-
-    @property
-    def start(self) -> float:
-        """How much later the clock of the nodes shows at the start (s)."""
-        return 0.0
-
-    @property
-    def args(self) -> tuple[str, ...]:
-        """ROS arguments of all nodes, before those of the world."""
-        return ()
-
-    @property
-    def period(self) -> float:
-        """How far events may be apart (s). What comes after the first such event is not compared."""
-        return 0.0
+    whole_world: ClassVar[bool] = True
 
     def under_test(self, nodes: Mapping[str, Endpoints], namespace: str) -> set[str]:
         """Return all nodes, or that which is named."""
         return Relation.under_test(self, nodes, namespace) if self.node else {*nodes}
-
-    def renamed(self, name: str, namespace: str) -> str:
-        """Return the full name of a node or a topic in the image."""
-        return name
-
-    def compared(self, message: Any) -> Any:
-        """Return a message of the image as it is compared."""
-        return message
 
 
 @dataclass(frozen=True, repr=False)
@@ -75,6 +53,11 @@ class Shifted(WholeWorld):
 
     seconds: Positive = 1000.0
     period: Positive = field(default=0.1, kw_only=True)
+
+    @property
+    def longest_move(self) -> float:
+        """How far an event may be moved (s). What comes after it is not compared."""
+        return self.period
 
     @property
     def start(self) -> float:
