@@ -17,6 +17,7 @@ __all__ = [
     'plots',
     'properties',
     'recording',
+    'relations',
     'simulation',
     'testing',
 ]

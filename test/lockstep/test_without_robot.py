@@ -13,7 +13,7 @@ from documentation.pages import PAGES, blocks
 from documentation.test_imports import FILES, PACKAGE, imports, place
 
 OF_ROBOTS = ('nodes', 'simulation', 'kinematics', 'control', 'calibration')
-ROOMS = ('lockstep', 'faults', 'properties', 'exploration', 'testing')
+ROOMS = ('lockstep', 'faults', 'properties', 'relations', 'exploration', 'testing')
 # Python imports it first of all in every process, also in those that `explore` starts.
 BLOCKER = f"""
 import sys
