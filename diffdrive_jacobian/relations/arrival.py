@@ -10,6 +10,7 @@ from diffdrive_jacobian.faults.fault import Fault, RosName
 from diffdrive_jacobian.lockstep._border import Endpoints
 from diffdrive_jacobian.numerics.checks import NotNegative, Positive
 from diffdrive_jacobian.relations.base import Relation
+from diffdrive_jacobian.relations.imaging import Imaging
 
 
 @dataclass(frozen=True, repr=False)
@@ -71,7 +72,6 @@ class Late(_Arrival):
             comes before a timer or after it may move an event by so much.
     """
 
-    perturbed: ClassVar[None] = None
     keeps_order: ClassVar[bool] = True
 
     seconds: Positive = 0.01
@@ -80,6 +80,10 @@ class Late(_Arrival):
     def heard(self, topic: str, message: Any) -> list[tuple[float, Any]]:
         """Return the message with its delay."""
         return [(self.seconds if self._is_of(topic) else 0.0, message)]
+
+    def nearby(self) -> list[Imaging]:
+        """Return none: between limits rounding decides nothing."""
+        return []
 
     @property
     def early(self) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 from diffdrive_jacobian.faults.fault import Expression, Fault
 from diffdrive_jacobian.lockstep._border import Endpoints
@@ -13,10 +13,12 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.numerics.checks import Positive
 from diffdrive_jacobian.relations.imaging import Imaging
-from diffdrive_jacobian.relations.perturbed import Numbers, Perturbed
+from diffdrive_jacobian.relations.perturbed import Perturbed
 
 TOLERANCE = 1e-6
 """Default tolerance of numbers, relative to those above 1."""
+PAIRS = 2
+"""Number of pairs of worlds that show whether rounding decides."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,9 +39,6 @@ class Relation(Imaging, Expression, ABC):
     node: str = field(default='', kw_only=True)
     tolerance: Positive = field(default=TOLERANCE, kw_only=True)
 
-    perturbed: ClassVar[type[Perturbed] | None] = Numbers
-    """What shows whether rounding decides, if it is changed; None: nothing is rounded otherwise."""
-
     @abstractmethod
     def image(self, topic: str, message: Any) -> Any:
         """Return the image of a message, which may be changed in place.
@@ -56,6 +55,14 @@ class Relation(Imaging, Expression, ABC):
     def said(self, topic: str, message: Any) -> Any:
         """Return what a node under test must say instead of a message."""
         return self.image(topic, message)
+
+    def nearby(self) -> list[Imaging]:
+        """Return images of the world that differ by little more than rounding, if at all.
+
+        Where one of them differs from the world, rounding may decide.
+        """
+        # In one of a pair each number grows by what it shrinks by in the other.
+        return [Perturbed(seed, sign, self.tolerance) for seed in range(PAIRS) for sign in (1, -1)]
 
     def is_disturbed_by(self, fault: Fault) -> bool:
         """Return whether it need not hold with a fault. Both worlds are without it then."""

@@ -21,7 +21,6 @@ from diffdrive_jacobian.relations.differences import (
 )
 from diffdrive_jacobian.relations.images import Image, image_of, images
 from diffdrive_jacobian.relations.imaging import Imaging
-from diffdrive_jacobian.relations.perturbed import nearby
 from diffdrive_jacobian.relations.worlds import Ran, Scene, decoded
 from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds
 
@@ -41,6 +40,8 @@ class Checked(NamedTuple):
     """Number of messages that were compared."""
     topics: frozenset[str] = frozenset()
     """Their topics, as in the first world."""
+    end: int = 0
+    """World time until which they were compared (ns)."""
     seconds: float = 0.0
     """Simulated time of the worlds that were run (s)."""
     note: str = ''
@@ -73,12 +74,14 @@ def checked(relation: Relation, first: Ran, scene: Scene) -> Checked:
         return result._replace(seconds=seconds)
     # Of all nodes that of the difference, so that the others keep their order.
     speaker = result.difference.speaker
-    names = names if speaker is None else {speaker.node}
-    for near in nearby(relation.perturbed, relation.tolerance) if relation.perturbed else ():
+    if speaker is not None and not relation.whole_world:
+        names = {speaker.node}
+    for near in relation.nearby():
         other = image_of(near, first, scene, names)
         seconds += other.ran.end / NANOSECONDS
-        moved = _compared(near, first, other, names).difference
-        if moved is not None and moved.time <= result.difference.time:
+        moved = _compared(near, first, other, names)
+        time = moved.end if moved.difference is None else moved.difference.time
+        if time <= result.difference.time:
             # Where a change of 1e-9 changes what is said, rounding may, too.
             return result._replace(difference=None, note=UNTIL_ROUNDING, seconds=seconds)
     return result._replace(seconds=seconds, digest=_digest(first, image.ran))
@@ -121,7 +124,7 @@ def _compared(imaging: Imaging, first: Ran, image: Image, names: Collection[str]
     found = [one for one in found if one.time < end or (one.speaker is None and one.time == end)]
     count = sum(one.time < end for spoken in expected.values() for one in spoken)
     topics = {one.speaker.topic for one in first.messages if one.speaker.node in names}
-    return Checked(_first(found, ran), count, frozenset(topics), note=note)
+    return Checked(_first(found, ran), count, frozenset(topics), end, note=note)
 
 
 def _first(found: Sequence[Difference], image: Ran) -> Difference | None:

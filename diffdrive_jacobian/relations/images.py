@@ -53,7 +53,6 @@ class _Hearing:
         """World time at which a request or the end of a node overtook what is late (ns); None: never."""
         self._until: dict[Node, int] = {}
         self._services: set[str] = set()
-        imaging.begin(world)
         if imaging.keeps_order:
             world.on_new_topics(self._look)
 

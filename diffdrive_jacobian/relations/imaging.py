@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from diffdrive_jacobian.lockstep.world import Lockstep
-
 
 class Imaging:
     """What makes the image of a world. By default it is the same. Base class of relations.
@@ -20,9 +18,6 @@ class Imaging:
     """Whether what a node hears later waits for what comes late."""
     whole_world: ClassVar[bool] = False
     """Whether all nodes run again, and hear each other."""
-
-    def begin(self, world: Lockstep) -> None:
-        """Begin the image, with a world without nodes."""
 
     def heard(self, topic: str, message: Any) -> list[tuple[float, Any]]:
         """Return what a node under test hears instead of a message: messages with their delays (s)."""

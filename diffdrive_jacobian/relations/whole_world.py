@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 from rclpy.exceptions import InvalidNamespaceException
@@ -15,11 +15,15 @@ from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.structure import Text, parts
 from diffdrive_jacobian.numerics.checks import Positive, nonempty
 from diffdrive_jacobian.relations.base import Relation
-from diffdrive_jacobian.relations.perturbed import Perturbed, Stamps
+from diffdrive_jacobian.relations.imaging import Imaging
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
 GLOBAL = ('/tf', '/tf_static')
 """Topics that all robots share, whose names stay."""
+LITTLE = 1.0, 2.0, 3.0, 5.0, 7.0, 11.0
+"""Times by which worlds are later that show whether rounding decides (s)."""
+COARSE = 100.0
+"""Their tolerance, relative to that of the relation. Rounding that decides moves more than numbers."""
 TIME = 'builtin_interfaces/Time'
 
 
@@ -27,7 +31,6 @@ TIME = 'builtin_interfaces/Time'
 class WholeWorld(Relation):
     """All nodes are under test, with the world in which they are. Base class."""
 
-    perturbed: ClassVar[type[Perturbed] | None] = None
     whole_world: ClassVar[bool] = True
 
     def under_test(self, nodes: Mapping[str, Endpoints], namespace: str) -> set[str]:
@@ -44,12 +47,11 @@ class Shifted(WholeWorld):
     cannot jump to a time before 0.
 
     Attributes:
-        seconds: How much later it is (s).
+        seconds: How much later it is (s). A multiple of the periods of all timers, because these tick
+            when the clock shows multiples of their periods.
         period: The longest period of the timers (s). From the first event on that is moved by up to this
             time, nothing is compared.
     """
-
-    perturbed: ClassVar[type[Perturbed]] = Stamps
 
     seconds: Positive = 1000.0
     period: Positive = field(default=0.1, kw_only=True)
@@ -63,6 +65,11 @@ class Shifted(WholeWorld):
     def start(self) -> float:
         """How much later the clock of the nodes shows at the start (s)."""
         return self.seconds
+
+    def nearby(self) -> list[Imaging]:
+        """Return worlds that are a little later. Their times are rounded otherwise, but as finely."""
+        coarse = COARSE * self.tolerance
+        return [replace(self, seconds=seconds, tolerance=coarse) for seconds in LITTLE]
 
     def is_disturbed_by(self, fault: Fault) -> bool:
         """Return whether the clock jumps."""
@@ -116,6 +123,10 @@ class Renamed(WholeWorld):
     def image(self, topic: str, message: Any) -> Any:
         """Return the message."""
         return message
+
+    def nearby(self) -> list[Imaging]:
+        """Return none: nothing is rounded otherwise."""
+        return []
 
     def renamed(self, name: str, namespace: str) -> str:
         """Return the full name of a node or a topic in the image."""
