@@ -72,19 +72,37 @@ def checked(relation: Relation, first: Ran, scene: Scene) -> Checked:
     seconds = image.ran.end / NANOSECONDS
     if result.difference is None:
         return result._replace(seconds=seconds)
-    # Of all nodes that of the difference, so that the others keep their order.
-    speaker = result.difference.speaker
-    if speaker is not None and not relation.whole_world:
-        names = {speaker.node}
-    for near in relation.nearby():
-        other = image_of(near, first, scene, names)
-        seconds += other.ran.end / NANOSECONDS
-        moved = _compared(near, first, other, names)
-        time = moved.end if moved.difference is None else moved.difference.time
-        if time <= result.difference.time:
-            # Where a change of 1e-9 changes what is said, rounding may, too.
-            return result._replace(difference=None, note=UNTIL_ROUNDING, seconds=seconds)
+    decides, spent = _rounding_decides(relation, first, scene, names, result.difference)
+    seconds += spent
+    if decides:
+        return result._replace(difference=None, note=UNTIL_ROUNDING, seconds=seconds)
     return result._replace(seconds=seconds, digest=_digest(first, image.ran))
+
+
+def _rounding_decides(
+    relation: Relation, first: Ran, scene: Scene, names: Collection[str], found: Difference
+) -> tuple[bool, float]:
+    """Return whether rounding may be the cause of a difference, and how much was simulated (s).
+
+    It may if a world that differs by little more than rounding differs until then, too, or cannot be
+    compared so far. Whole worlds that all differ, do for another reason.
+    """
+    if found.speaker is not None and not relation.whole_world:
+        # The others keep their order.
+        names = {found.speaker.node}
+    seconds, same, differ = 0.0, 0, 0
+    for near in relation.nearby():
+        image = image_of(near, first, scene, names)
+        seconds += image.ran.end / NANOSECONDS
+        result = _compared(near, first, image, names)
+        until = result.end if result.difference is None else result.difference.time
+        if found.time < until:
+            same += 1
+        else:
+            differ += 1
+        if differ and (same or not relation.whole_world):
+            return True, seconds
+    return False, seconds
 
 
 def _compared(imaging: Imaging, first: Ran, image: Image, names: Collection[str]) -> Checked:

@@ -143,3 +143,11 @@ def moving(world, case):
     """Change the working directory, and fail."""
     os.chdir('/')
     raise ValueError('moved')
+
+
+def mute(world, case):
+    """Let a node hear a sensor, and say nothing."""
+    world.create(lambda: Sensor(1.0))
+    listener = world.create(lambda: Node('listener', start_parameter_services=False))
+    listener.create_subscription(Vector3, 'speed', lambda _: None, 10)
+    world.run_for(0.3)

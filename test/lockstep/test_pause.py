@@ -1,0 +1,219 @@
+"""Stopping a world in a debugger, and taking one's time there."""
+
+from __future__ import annotations
+
+import inspect
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from std_msgs.msg import Float64
+from users_nodes import Blinker
+
+from diffdrive_jacobian.lockstep import _guard
+from diffdrive_jacobian.properties import FieldWithin
+from diffdrive_jacobian.relations import Repeated, check_relation
+from diffdrive_jacobian.testing import Lockstep, LockstepError, PropertyViolation
+
+TEST = """
+from users_nodes import Blinker
+
+
+def test_blinks(lockstep):
+    lockstep.pause_at(0.25)
+    node = lockstep.create(lambda: Blinker(rate=10.0))
+    lockstep.run_for(1.0)
+    assert len(node.ticks) == 11
+"""
+
+
+@pytest.fixture
+def stops(monkeypatch):
+    """Return the stops in a debugger that does what its `act` says."""
+    found = []
+
+    class Stops(list):
+        act = staticmethod(lambda world: None)
+
+    found = Stops()
+
+    def hook(header=''):
+        world = sys._getframe(1).f_locals['world']
+        found.append((world.world_seconds, header))
+        found.act(world)
+
+    monkeypatch.setattr(sys, 'breakpointhook', hook)
+    return found
+
+
+def test_a_world_stops_before_anything_happens_at_a_time(lockstep, stops):
+    node = lockstep.create(lambda: Blinker(rate=10.0))
+    lockstep.pause_at(0.3)
+    lockstep.pause_at(0.55, 'my world')
+    stops.act = lambda world: ticks.append(len(node.ticks))
+    ticks = []
+    lockstep.run_until(lambda: lockstep.world_seconds >= 1.0, 2.0)
+    assert [seconds for seconds, _ in stops] == pytest.approx([0.2, 0.5])
+    assert stops[1][1].startswith('my world is paused at 0.5 s, before 0.6 s: world.step() goes on')
+    assert ticks == [3, 6]
+    assert len(node.ticks) == 11
+
+
+def test_who_stops_may_step_publish_and_pass_the_end(lockstep, stops):
+    node = lockstep.create(lambda: Blinker(rate=10.0))
+
+    def act(world):
+        world.step()
+        assert len(node.ticks) == 4
+        world.run_for(1.0)
+
+    stops.act = act
+    lockstep.pause_at(0.3)
+    lockstep.run_for(0.5)
+    assert lockstep.world_seconds == 1.3
+    assert len(node.ticks) == 14
+
+
+def test_a_violation_at_the_prompt_is_raised_there(lockstep, stops):
+    lockstep.create(lambda: Blinker(rate=10.0))
+    lockstep.require(FieldWithin('blink', 'nanosec', 0.0, 2.5e8))
+
+    def act(world):
+        with pytest.raises(PropertyViolation):
+            world.step()
+
+    stops.act = act
+    lockstep.pause_at(0.3)
+    lockstep.run_for(1.0)
+    assert len(stops) == 1
+
+
+def test_debuggers_without_a_text_stop_too(lockstep, monkeypatch):
+    calls = []
+
+    def hook():
+        calls.append(lockstep.world_seconds)
+
+    monkeypatch.setattr(sys, 'breakpointhook', hook)
+    lockstep.create(lambda: Blinker(rate=10.0))
+    lockstep.pause_at(0.0)
+    lockstep.run_for(0.5)
+    assert calls == [0.0]
+
+
+@pytest.mark.parametrize('seconds', [-1.0, float('nan'), 'soon', 0.1])
+def test_a_pause_is_in_the_future(lockstep, seconds):
+    lockstep.create(lambda: Blinker(rate=10.0))
+    lockstep.run_for(0.2)
+    with pytest.raises(ValueError, match='seconds must'):
+        lockstep.pause_at(seconds)
+
+
+def test_a_pause_that_never_came_is_told():
+    world = Lockstep()
+    world.pause_at(2.0)
+    world.create(Blinker)
+    world.run_for(0.5)
+    with pytest.warns(UserWarning, match=r'pause_at\(2\): the world has ended at 0.5 s'):
+        world.close()
+
+
+def test_each_world_of_a_relation_stops(stops):
+    def blinking(world, case):
+        world.create(lambda: Blinker(rate=10.0))
+        world.create(lambda: Blinker('other', rate=10.0))
+        world.find('other').create_subscription(type(world.last('blink')), 'blink', lambda _: None, 10)
+        world.run_for(0.5)
+
+    with pytest.raises(LockstepError, match='no node is subscribed to /nothing'):
+        check_relation(blinking, Repeated('nothing'), pause_at=0.2)
+    check_relation(blinking, Repeated('blink'), pause_at=0.2)
+    assert [header.partition(' is')[0] for _, header in stops] == [
+        *('the first world', 'the first world'),
+        'the image',
+    ]
+
+
+class Sleeper(Blinker):
+    """Takes its time in a callback."""
+
+    def on_tick(self):
+        super().on_tick()
+        if len(self.ticks) == 3:
+            time.sleep(1.2)
+
+
+def test_nothing_has_a_limit_of_time_from_then_on(stops):
+    for paused in (True, False):
+        with Lockstep(patience=0.5) as world:
+            world.create(lambda: Sleeper(rate=10.0))
+            if paused:
+                world.pause_at(0.1)
+                world.run_for(0.5)
+            else:
+                with pytest.raises(LockstepError, match='has not returned for'):
+                    world.run_for(0.5)
+
+
+def test_nor_has_a_callback_in_which_a_debugger_is(monkeypatch):
+    monkeypatch.setattr(_guard, 'debugger_is_active', lambda: True)
+    with Lockstep(patience=0.5) as world:
+        world.create(lambda: Sleeper(rate=10.0))
+        world.run_for(0.5)
+
+
+@pytest.mark.process
+def test_pdb_of_pytest_has_the_world(tmp_path):
+    """And no limit for a breakpoint in a callback, other than `Lockstep(patience=)`."""
+    (tmp_path / 'test_blink.py').write_text(TEST)
+    (tmp_path / 'users_nodes.py').write_text(Path(__file__).with_name('users_nodes.py').read_text())
+    line = inspect.getsourcelines(Blinker.on_tick)[1] + 1
+    commands = (
+        *('world.step()', 'len(world.find("blinker").ticks)', f'b users_nodes.py:{line}', 'c'),
+        'from diffdrive_jacobian.lockstep import _guard',
+        *('_guard.debugger_is_active()', 'cl 1', 'c', ''),
+    )
+    done = subprocess.run(
+        [sys.executable, '-m', 'pytest', '-p', 'no:cacheprovider', str(tmp_path)],
+        input='\n'.join(commands),
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stdout
+    assert 'the world is paused at 0.2 s, before 0.3 s: world.step() goes on' in done.stdout
+    assert '(Pdb) 4' in done.stdout
+    assert f'users_nodes.py({line})on_tick()' in done.stdout
+    assert '(Pdb) True' in done.stdout
+
+
+@pytest.mark.process
+@pytest.mark.parametrize('paused', [True, False])
+def test_a_process_may_take_its_time(paused, stops):
+    """As one that a debugger stops. Without a pause that is an error."""
+    program = [sys.executable, str(Path(__file__).with_name('external_nodes.py')), 'echo']
+    with Lockstep() as world:
+        if paused:
+            world.pause_at(0.1)
+        process = world.start(program, patience=1.0)
+        world.publish('echo/in', Float64(data=1.0))
+        process.signal(signal.SIGSTOP)
+        goes_on = threading.Timer(2.5, process.signal, [signal.SIGCONT])
+        goes_on.start()
+        if paused:
+            begin = time.monotonic()
+            world.publish('echo/in', Float64(data=2.0))
+            assert time.monotonic() - begin > 1.5
+            assert world.last('echo/out').frame_id == '2'
+            world.run_for(0.2)
+            assert f'pid {process.pid}: ' in stops[0][1]
+        else:
+            with pytest.raises(LockstepError, match='not quiet within 1 s'):
+                world.publish('echo/in', Float64(data=2.0))
+        goes_on.join()

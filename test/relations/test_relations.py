@@ -1,0 +1,321 @@
+"""Comparing worlds with their images: what is found, what is not, and why."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from dataclasses import dataclass
+
+import pytest
+from geometry_msgs.msg import Vector3
+from relation_nodes import (
+    Answer,
+    Echo,
+    Source,
+    age,
+    crashing,
+    from_the_clock,
+    impatient,
+    previous,
+    scene,
+    side,
+    total,
+)
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian import relations
+from diffdrive_jacobian.faults import Kill, Loss, Slow, TimeJump
+from diffdrive_jacobian.lockstep._border import Border
+from diffdrive_jacobian.relations import (
+    Late,
+    Mirrored,
+    Moved,
+    Relation,
+    Renamed,
+    Repeated,
+    Shifted,
+    check_relation,
+)
+from diffdrive_jacobian.relations.checking import (
+    UNTIL_OTHERS,
+    UNTIL_OVERTAKEN,
+    UNTIL_ROUNDING,
+    checked,
+)
+from diffdrive_jacobian.relations.worlds import Scene, decoded
+from diffdrive_jacobian.testing import Lockstep, LockstepError, PropertyViolation
+
+QUIET = ('--ros-args', '--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
+
+
+@dataclass(frozen=True, repr=False)
+class Negated(Relation):
+    """Negative numbers give negative answers."""
+
+    def image(self, topic, message):
+        vector = message.vector if topic.endswith('number') else message
+        vector.x = -vector.x
+        return message
+
+
+NEGATED = Negated(node='answer')
+
+
+def result(relation, scenario, **arguments):
+    """Return how an image compares."""
+    played = Scene(scenario=scenario, case=None, args=QUIET, **arguments)
+    return checked(relation, played.run('the first world'), played)
+
+
+# --- What is found
+
+
+@pytest.mark.parametrize(
+    ('answer', 'relation', 'text'),
+    [
+        (lambda _, message: abs(message.vector.x), NEGATED, '/answer on /answer: x is 1, expected -1'),
+        (total, Repeated('number'), '/answer on /answer: Vector3(x=2) is said, expected nothing'),
+        (
+            lambda node, message: message.vector.x if message.vector.x not in node.seen else None,
+            Repeated('number', after=0.15),
+            None,
+        ),
+        (lambda *_: 0.0, Repeated('number', after=0.15), 'Vector3() is said, expected nothing'),
+        (impatient, Late('number'), 'Vector3(x=1), and nothing is said in the image'),
+        (age, Late('number', 0.05), 'x is 0, expected from 0.05 to 0.05, as it is said in the image'),
+        (from_the_clock, Shifted(), '/answer on /answer: x is 1001, expected 1'),
+        (crashing, Negated(node='answer', tolerance=1e9), 'it raised ZeroDivisionError: float division'),
+        (previous, NEGATED, None),
+        (previous, Repeated('number'), 'Vector3(x=1) is said, expected nothing'),
+        (total, NEGATED, None),
+        (total, Late('number'), None),
+        (age, Shifted(), None),
+        (age, Renamed(), None),
+        (None, Repeated('number'), None),
+    ],
+)
+def test_a_relation_finds_its_defect(answer, relation, text):
+    values = (lambda count: 8.0 if count > 3 else 1.0) if answer is crashing else math.cos
+    difference = result(relation, scene(answer, values)).difference
+    assert (difference is None) == (text is None), difference
+    assert difference is None or text in difference.text
+
+
+def test_names_that_are_in_no_namespace_are_found():
+    relation = Renamed('/robots/r1')
+    text = result(relation, scene(topic='/answer')).difference.text
+    assert text.startswith('/robots/r1/answer on /answer: Vector3(x=1) is said, expected nothing')
+    inside = (*QUIET, '--ros-args', '-r', '__ns:=/r')
+    check_relation(scene(age), relation, args=inside)
+
+
+def test_texts_may_have_the_namespace_or_not():
+    def scenario(world, case):
+        publisher = world.create(Source).create_publisher(String, 'frame', 10)
+        name = world.find('source').get_namespace().lstrip('/')
+        for text in ('odom', f'{name}/odom' if name else 'odom'):
+            publisher.publish(String(data=text))
+        world.run_for(0.1)
+
+    check_relation(scenario, Renamed('r1'))
+    with pytest.raises(ValueError, match='Renamed: namespace must be a namespace such as'):
+        Renamed('no spaces')
+
+
+def test_a_violation_is_one_of_a_property():
+    with pytest.raises(PropertyViolation) as raised:
+        check_relation(scene(total), Repeated('number'), args=QUIET)
+    violation = raised.value
+    assert str(violation).startswith("Repeated('number') is violated at 0 s: /answer on /answer: ")
+    assert (violation.property, violation.seconds) == (Repeated('number'), 0.0)
+    assert pickle.loads(pickle.dumps(violation)).text == violation.text
+
+
+# --- What is not
+
+
+def test_only_the_nodes_under_test_run_again():
+    """The others hear what was said in the first world, in the same order, whatever is said now."""
+    scenario = scene(lambda *_: 0.5)
+    first = Scene(scenario=scenario, case=None, args=QUIET).run('the first world')
+
+    def silent(world, case):
+        world.create(lambda: Answer(lambda *_: None))
+        world.create(Echo)
+        world.create(Source)
+        world.run_for(1.0)
+
+    again = Scene(scenario=silent, case=None, args=QUIET).run(
+        'the image',
+        lambda world: Border(world, first.messages, {'/answer'}, lambda _, data: [(0, data)]),
+    )
+
+    def of_others(ran):
+        return [
+            (one.time, one.speaker, decoded(one))
+            for one in ran.messages
+            if one.speaker.node != '/answer'
+        ]
+
+    assert of_others(again) == of_others(first)
+    assert {one.speaker.node for one in again.messages} == {'/source', '/echo'}
+    assert sum(one.speaker.node == '/echo' for one in first.messages) == 11
+
+
+def test_what_rounding_decides_is_no_difference():
+    """At zero, and from there on."""
+    sides = scene(side, lambda count: 1.0 if count < 4 else 0.0)
+    found = result(NEGATED, sides)
+    assert (found.difference, found.note) == (None, UNTIL_ROUNDING)
+    assert found.compared > 0
+    wrong = scene(side, lambda count: -1.0 if count < 4 else 0.0)
+    assert result(NEGATED, wrong).difference is None
+    clamped = scene(lambda _, message: max(-0.5, message.vector.x), lambda count: math.cos(count))
+    assert result(NEGATED, clamped).difference.time == 0
+
+
+def test_rounding_of_times_may_move_an_event_by_a_period():
+    """0.3 s after a message, which is more or less than 0.3 in floats."""
+
+    def late(node, message):
+        node.first = getattr(node, 'first', from_the_clock(node, message))
+        return float(from_the_clock(node, message) - node.first > 0.3)
+
+    found = [result(Shifted(float(seconds)), scene(late)) for seconds in (1, 3, 7, 1000, 4000)]
+    assert [one.difference for one in found] == [None] * 5
+    assert {one.note for one in found} == {'', UNTIL_ROUNDING}
+
+
+def test_faults_that_disturb_a_relation_are_left_out():
+    lost = [Loss('number', start=0.2, duration=0.3)]
+    slow = [*lost, Slow('answer', 0.15)]
+    assert result(NEGATED, scene(total), faults=slow).difference is None
+    check_relation(scene(total), Late('number'), faults=slow, args=QUIET)
+    back = [TimeJump(-5.0, start=0.5)]
+    check_relation(scene(age), Shifted(), faults=back, args=QUIET)
+    # Random numbers are the same in each namespace.
+    check_relation(scene(total), Renamed(), faults=[Loss('number', probability=0.5)], args=QUIET)
+
+
+def test_a_node_is_under_test_again_after_it_was_killed():
+    killed = [Kill('answer', start=0.35, duration=0.3)]
+    check_relation(scene(total), NEGATED, faults=killed, args=QUIET)
+    broken = scene(lambda node, message: total(node, message) ** (2 if len(node.seen) == 2 else 1))
+    assert result(NEGATED, broken, faults=killed).difference.time == 200_000_000
+
+
+def test_requests_and_ends_that_overtake_what_is_late_end_the_comparison():
+    def asking(world, case):
+        scene(total, end=0.5)(world, case)
+        world.call(Trigger, 'forget')
+        world.run_for(0.5)
+
+    def leaving(world, case):
+        scene(total, end=0.5)(world, case)
+        world.find('answer').destroy_node()
+        world.run_for(0.5)
+
+    for scenario in (asking, leaving):
+        found = result(Late('number', 0.05), scenario)
+        assert (found.difference, found.note) == (None, UNTIL_OVERTAKEN)
+        assert found.compared == 5
+    assert result(NEGATED, asking).note == ''
+
+
+def test_a_scenario_that_looks_into_the_node_ends_the_comparison():
+    def looking(world, case):
+        scene(total, end=0.5)(world, case)
+        publisher = world.node.create_publisher(Vector3, 'sum', 10)
+        publisher.publish(Vector3(x=sum(world.find('answer').seen)))
+        world.run_for(0.5)
+
+    found = result(NEGATED, looking)
+    assert (found.difference, found.note, found.end) == (None, UNTIL_OTHERS, 500_000_000)
+
+
+def test_errors_of_the_first_world_are_raised():
+    def failing(world, case):
+        scene()(world, case)
+        raise KeyError(case)
+
+    with pytest.raises(KeyError):
+        check_relation(failing, NEGATED, case=7, args=QUIET)
+
+
+# --- Misuse
+
+
+@dataclass(frozen=True, repr=False)
+class Wrong(Relation):
+    """Has no right image."""
+
+    kind: str = 'None'
+
+    def image(self, topic, message):
+        return {'None': None, 'error': lambda: 1 // 0, 'type': Vector3()}[self.kind] or 1 // 0
+
+
+@pytest.mark.parametrize(
+    ('relation', 'text'),
+    [
+        (Repeated('nothing'), 'no node is subscribed to /nothing; nodes: /answer, /echo, /source'),
+        (Moved(), r'Moved\(\): no node publishes /cmd_vel; nodes:'),
+        (Repeated('number', node='nobody'), 'there is no node /nobody; nodes: /answer'),
+        (Negated(), 'needs the node under test: Negated'),
+        (Repeated('number', node='source'), None),
+        (Wrong(node='answer'), 'image of a message of /number: it raised ZeroDivisionError'),
+        (Wrong('type', node='answer'), 'must be a Vector3Stamped, got'),
+        (Late, r'check_relation takes a relation, got .*create one: Late\(\)'),
+    ],
+)
+def test_misuse_is_an_error(relation, text):
+    if text is None:
+        check_relation(scene(), relation, args=QUIET)
+        return
+    with pytest.raises(LockstepError, match=text):
+        check_relation(scene(), relation, args=QUIET)
+
+
+def test_that_nothing_was_said_is_an_error():
+    mute = scene(lambda *_: None)
+    with pytest.raises(LockstepError, match='nothing was compared: the nodes under test said nothing'):
+        check_relation(mute, NEGATED, args=QUIET)
+
+
+def test_a_world_that_is_open_bars_others(lockstep):
+    with pytest.raises(LockstepError, match='another Lockstep is open'):
+        check_relation(scene(), NEGATED)
+
+
+# --- Values and pages
+
+
+VALUES = [
+    (Moved(), 'Moved()'),
+    (Moved(1.0, theta=0.5), 'Moved(x=1.0, theta=0.5)'),
+    (Mirrored(commands='cmd'), "Mirrored(commands='cmd')"),
+    (Shifted(10.0), 'Shifted(seconds=10.0)'),
+    (Repeated('odom', after=0.1), "Repeated('odom', after=0.1)"),
+    (Late('odom', 0.02, node='a'), "Late('odom', seconds=0.02, node='a')"),
+    (Renamed('r1'), "Renamed(namespace='/r1')"),
+]
+
+
+def test_relations_are_values():
+    kinds = {getattr(relations, name) for name in relations.__all__}
+    assert {type(one) for one, _ in VALUES} == kinds - {Relation, check_relation}
+    for one, expression in VALUES:
+        assert repr(one) == expression
+        assert eval(expression, vars(relations)) == one == pickle.loads(pickle.dumps(one))
+
+
+def test_worlds_say_what_they_are():
+    said = []
+    played = Scene(
+        scenario=scene(), case=None, args=QUIET, on_world=lambda world, what: said.append(what)
+    )
+    checked(NEGATED, played.run('the first world'), played)
+    assert said == ['the first world', 'the image']
+    with Lockstep():
+        pass
