@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise, zip_longest
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from diffdrive_jacobian.lockstep._border import Speaker
@@ -237,13 +239,13 @@ def _outside(
     for one in image:
         if one.time + early >= end:
             break
-        near = [two for two in expected if one.time - late <= two.time <= one.time + early]
+        near = _around(expected, one.time - late, one.time + early)
         if text := _not_between(one, near, tolerance, early + late):
             found.append(Difference(one.time, f'{text} around this time'))
     for one in expected:
         if one.time + late >= end:
             break
-        near = [two for two in image if one.time - early <= two.time <= one.time + late]
+        near = _around(image, one.time - early, one.time + late)
         if text := _not_between(one, near, tolerance, early + late):
             found.append(Difference(one.time, f'{text} in the image around this time'))
     if not found:
@@ -251,6 +253,12 @@ def _outside(
     first = min(found, key=lambda difference: difference.time)
     text = f'{speaker.node} on {speaker.topic}: {first.text}'
     return Difference(first.time, text, speaker)
+
+
+def _around(spoken: Sequence[Spoken], first: int, last: int) -> Sequence[Spoken]:
+    """Return what was said between two times (ns), both included."""
+    begin = bisect_left(spoken, first, key=attrgetter('time'))
+    return spoken[begin : bisect_right(spoken, last, key=attrgetter('time'))]
 
 
 def _not_between(one: Spoken, near: Sequence[Spoken], tolerance: float, late: int) -> str:

@@ -30,5 +30,7 @@ def test_a_program_that_does_what_it_must(relation):
 
 
 def test_a_program_that_counts_is_found():
-    with pytest.raises(PropertyViolation, match=r"Repeated\('ticker/in'\) is violated at 0.05 s: /ticker"):
+    with pytest.raises(
+        PropertyViolation, match=r"Repeated\('ticker/in'\) is violated at 0.05 s: /ticker"
+    ):
         check_relation(answering, Repeated('ticker/in'), case='ticker')
