@@ -272,7 +272,11 @@ class Search:
             stopped=self.stopped,
             unseen=self.summary.unseen(self.worlds, self.faults),
             notes=(
-                *(f'{one}: nothing was compared' for one, count in self.compared.items() if not count),
+                *(
+                    f'{one}: nothing was compared, or heard otherwise'
+                    for one, count in self.compared.items()
+                    if not count
+                ),
                 *(
                     f'{text} ({count} of {self.worlds} worlds)'
                     for text, count in self.complaints.most_common()

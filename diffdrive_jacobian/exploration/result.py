@@ -25,6 +25,7 @@ from diffdrive_jacobian.exploration.trial import (
     of_exception,
 )
 from diffdrive_jacobian.exploration.unseen import Unseen
+from diffdrive_jacobian.lockstep._pause import ends_all
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.text import printable
 
@@ -277,6 +278,8 @@ def reproducing(world: Lockstep | None, case: Path) -> Iterator[None]:
         try:
             yield
         except (Exception, SystemExit) as error:
+            if ends_all(error):
+                raise
             violation = of_exception(error, 0.0 if world is None else world.world_seconds)
             digest = getattr(error, 'digest', '') if messages is None else messages.value()
             compared = Replay.compared(violation, digest, found, fields['versions'])

@@ -23,6 +23,7 @@ from diffdrive_jacobian.faults import Fault
 from diffdrive_jacobian.faults.fault import Expression
 from diffdrive_jacobian.lockstep._border import Said
 from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError, PropertyViolation
+from diffdrive_jacobian.lockstep._pause import ends_all
 from diffdrive_jacobian.lockstep._properties import answer
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.structure import (
@@ -226,9 +227,9 @@ def run(
                         # As in the images.
                         world.settle()
                     complaints = _finish(world)
-                except KeyboardInterrupt:
-                    raise
                 except BaseException as error:
+                    if ends_all(error):
+                        raise
                     ended = error
                     # What ends the world because of `only` is collected already.
                     if not isinstance(getattr(error, 'property', None), _Collecting):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from rclpy.exceptions import InvalidHandle
@@ -33,6 +33,8 @@ class Seen:
     """Topics that a property observes."""
     faulted: frozenset[str] = frozenset()
     """Nodes and topics that a fault affects."""
+    changed: frozenset[tuple[str, str]] = frozenset()
+    """Parameters that a fault changes, by node and name."""
     parameters: Mapping[tuple[str, str], str] = field(default_factory=dict)
     """Value of each parameter, by node and name."""
 
@@ -48,8 +50,7 @@ class Watcher:
     def seen(self, faults: Iterable[Fault]) -> Seen:
         """Return what it had until now."""
         own = self._world.node
-        faulted = set()
-        parameters = self._parameters()
+        faulted, changed = set(), set()
         for one in faults:
             if topic := getattr(one, 'topic', ''):
                 faulted.add(own.resolve_topic_name(topic))
@@ -57,10 +58,17 @@ class Watcher:
                 node = absolute_name(one.affected_node, own)
                 faulted.add(node)
                 if isinstance(one, ParameterChange):
-                    parameters[node, one.name] = f'changed to {one.value!r:.{LONGEST}}'
+                    changed.add((node, one.name))
         said = {source.topic for _, source in self._world._scheduler.links.sources()}
         observed = frozenset(self._world._properties.observed)
-        return Seen(self._nodes, frozenset(said), observed, frozenset(faulted), parameters)
+        return Seen(
+            self._nodes,
+            frozenset(said),
+            observed,
+            frozenset(faulted),
+            frozenset(changed),
+            self._parameters(),
+        )
 
     def _parameters(self) -> dict[tuple[str, str], str]:
         values = {}
@@ -120,15 +128,17 @@ class Summary:
         self._said: set[str] = set()
         self._checked: set[str] = set()
         self._faulted: set[str] = set()
+        self._changed: set[tuple[str, str]] = set()
         self._values: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
 
-    def add(self, seen: Seen, compared: Iterable[str]) -> None:
+    def add(self, seen: Seen, compared: Collection[str]) -> None:
         """Add a world, and the topics that relations compared in it."""
         self._nodes.update(seen.nodes)
         for endpoints in seen.nodes.values():
             self._published |= endpoints.published
             self._subscribed |= endpoints.subscribed
-        self._said |= seen.said
+        self._said |= {*seen.said, *compared}
+        self._changed |= seen.changed
         self._checked |= {*seen.observed, *compared}
         self._faulted |= seen.faulted
         for key, value in seen.parameters.items():
@@ -141,7 +151,9 @@ class Summary:
         """
         known = self._published | self._subscribed
         ours = known.difference(NOT_OF_ROBOTS)
-        same = [key for key, values in self._values.items() if len(values) == 1]
+        same = [
+            key for key, values in self._values.items() if len(values) == 1 and key not in self._changed
+        ]
         return Unseen(
             nodes=tuple(sorted(self._nodes - self._faulted)) if faults else (),
             topics=tuple(sorted((self._subscribed & ours) - self._faulted)) if faults else (),

@@ -36,7 +36,7 @@ IN_WORLD = """{marker}def test_{name}(lockstep):
         {scenario}(lockstep, CASE)
         lockstep.finish()"""
 WITH_IMAGE = """def test_{name}():
-    # To stop there in a debugger: check_relation(..., pause_at={seconds!r})
+    # To stop there in a debugger, add: pause_at={seconds!r}
     with reproducing(None, HERE / '{file}'):
         check_relation({scenario}, {relation}, case=CASE{arguments})"""
 

@@ -84,17 +84,20 @@ class Said:
         self.nodes = endpoints_of(world)
         """All nodes that there were, by their full names, without those that belong to the test."""
         self._speakers: dict[Publisher, Speaker | None] = {}
+        self._publish: Callable[..., None]
 
     def __enter__(self) -> Said:
         """Start to listen."""
 
         def listening(publish: Callable[..., None]) -> Callable[..., None]:
+            self._publish = publish
+
             def send(publisher: Publisher, msg: Any) -> None:
                 if self._scheduler.gates.running is not None or self._speaker(publisher) is None:
                     # It is sent when the callback of a slow node ends, or is none of a node.
                     publish(publisher, msg)
                 else:
-                    self._on_message(publish, publisher, msg)
+                    self._on_message(publisher, msg)
 
             return send
 
@@ -105,9 +108,9 @@ class Said:
         """Stop."""
         self._restore()
 
-    def _on_message(self, publish: Callable[..., None], publisher: Publisher, msg: Any) -> None:
+    def _on_message(self, publisher: Publisher, msg: Any) -> None:
         self._note(publisher, msg)
-        publish(publisher, msg)
+        self._publish(publisher, msg)
 
     def _note(self, publisher: Publisher, msg: Any) -> None:
         speaker = self._speakers[publisher]
@@ -158,11 +161,12 @@ class Border(Said):
             else:
                 others += 1
         self._others = 0
-        self._publish: Callable[..., None]
+        self._said: dict[str, Any] = {}
 
     def __enter__(self) -> Border:
         """Put the nodes apart."""
         super().__enter__()
+        self._world.said_apart = self._said
         agenda = self._scheduler.agenda
         for time in dict.fromkeys(message.time for _, message in self._due):
             agenda.at(time, self._say)
@@ -179,13 +183,14 @@ class Border(Said):
 
         return stage
 
-    def _on_message(self, publish: Callable[..., None], publisher: Publisher, msg: Any) -> None:
+    def _on_message(self, publisher: Publisher, msg: Any) -> None:
         self._note(publisher, msg)
-        self._publish = publish
         speaker = self._speakers[publisher]
         if speaker is not None and speaker.node not in self._apart:
-            publish(publisher, msg)
+            self._publish(publisher, msg)
             self._others += 1
+        else:
+            self._said[publisher.topic_name] = msg
         self._say()
 
     def _say(self) -> None:

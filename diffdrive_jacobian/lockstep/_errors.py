@@ -83,7 +83,8 @@ def raised(error: Exception) -> str:
     """Return what a property has raised instead of an answer, and where, as text."""
     *_, last = traceback.extract_tb(error.__traceback__)
     name = type(error).__name__
-    return f'it raised {name}: {error_text(error)}, in {last.filename}:{last.lineno} ({last.name})'
+    text = f': {error_text(error)}' if error_text(error) else ''
+    return f'it raised {name}{text}, in {last.filename}:{last.lineno} ({last.name})'
 
 
 def described(value: Any) -> str:

@@ -23,7 +23,12 @@ import rclpy
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.lockstep._errors import InitializedError, LockstepError, described
+from diffdrive_jacobian.lockstep._errors import (
+    InitializedError,
+    LockstepError,
+    PropertyViolation,
+    described,
+)
 from diffdrive_jacobian.lockstep._fault_log import FaultEvent
 from diffdrive_jacobian.lockstep._faults import Faults
 from diffdrive_jacobian.lockstep._guard import Guard
@@ -149,6 +154,11 @@ class Lockstep:
         self._time.processes = self._processes
         self._guard = guard
         self.paused_as = 'the world'
+        """What this world is, where it is paused."""
+        self.said_apart: dict[str, Any] | None = None
+        """What nodes that are apart have said last, by topic; None: none is."""
+        self.violated: PropertyViolation | None = None
+        """What a property has raised last."""
         self._time.pause = partial(pause, self)
         self._messaging = Messaging(scheduler, self._nodes, self._time, self.report)
         self._faults = Faults(scheduler, self._nodes, self.settle)
@@ -526,7 +536,14 @@ class Lockstep:
         """
         self._check_open()
         self._properties.require(self, properties)
-        self._time.check = self._properties.check
+        self._time.check = self._check
+
+    def _check(self) -> None:
+        try:
+            self._properties.check()
+        except PropertyViolation as violation:
+            self.violated = violation
+            raise
 
     def finish(self) -> None:
         """Check the properties at the end of a run. Nothing is required any longer afterwards.

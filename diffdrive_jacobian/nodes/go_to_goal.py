@@ -45,7 +45,7 @@ from diffdrive_jacobian.ros.graph_faults import topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
-from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds, nanoseconds
+from diffdrive_jacobian.time_units import nanoseconds
 
 __all__ = ['GoToGoal']
 
@@ -101,6 +101,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._goal: ActiveGoal | None = None
         self._goals_received = 0
         self._state = State((0, 0), '', (0.0, 0.0, 0.0), STANDSTILL)
+        # Stamp of odometry that was older than the last; None: the last was newer than that before.
+        self._older: tuple[int, int] | None = None
         self._rate = OdometryRate()
         # Whether the last command makes the robot move: it outlives a goal that is replaced.
         self._driving = False
@@ -149,9 +151,10 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             )
         if goal is not None and now == 0:
             raise MessageError(NO_CLOCK)
-        if state.stamp <= self._state.stamp and self._is_old(state, now):
+        stale = goal is not None and goal.stale
+        if state.stamp <= self._state.stamp and self._is_old(state) and not stale:
             return
-        self._state = state
+        self._state, self._older = state, None
         if goal is None:
             return
         self._watchdog.feed(now)
@@ -179,20 +182,22 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             return
         self._publish_command(command, now)
 
-    def _is_old(self, state: State, now: int) -> bool:
+    def _is_old(self, state: State) -> bool:
         """Return whether odometry that is not newer than the last comes again, or out of order.
 
-        Otherwise its source has no stamps, or has started again, or the clock was reset.
+        Not if its stamps do not tell: they are zero, or equal while the robot moves. If what comes next
+        is not newer either, but newer than this, its source has started again, or the clock was reset.
         """
-        last = self._state.stamp
-        age = (last[0] - state.stamp[0]) * NANOSECONDS + last[1] - state.stamp[1]
-        in_future = last[0] * NANOSECONDS + last[1] > now
-        if state.stamp == (0, 0) or in_future or age > nanoseconds(self.parameters.odom_timeout):
+        if state.stamp == (0, 0):
+            return False
+        before, self._older = self._older, state.stamp
+        if state.stamp == self._state.stamp:
+            return state == self._state
+        if before is not None and state.stamp > before:
             return False
         self.log_event_warning(
             'odometry is old',
-            f'odometry on {self.resolve_topic_name("odom")} is ignored: its stamp is '
-            f'{in_seconds(age)} before the newest; does it come twice, or out of order?',
+            f'odometry on {self.resolve_topic_name("odom")} is ignored: it is older than the last one',
         )
         return True
 

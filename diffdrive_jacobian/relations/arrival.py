@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, ClassVar
 
 from diffdrive_jacobian.faults.fault import Fault, RosName
-from diffdrive_jacobian.lockstep._border import Endpoints
+from diffdrive_jacobian.lockstep._border import Endpoints, Message
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.numerics.checks import NotNegative, Positive
 from diffdrive_jacobian.relations.base import Relation
 from diffdrive_jacobian.relations.imaging import Imaging
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 
 @dataclass(frozen=True, repr=False)
@@ -36,9 +42,9 @@ class _Arrival(Relation):
         """Return the nodes that are subscribed to the topic."""
         return self._with_topic(nodes, namespace, self.topic, 'subscribed')
 
-    def _is_of(self, topic: str) -> bool:
-        """Return whether a full name is that of the topic, whatever its namespace."""
-        return topic == self.topic or topic.endswith(f'/{self.topic}')
+    def in_world(self, world: Lockstep) -> Imaging:
+        """Return it with the full name that its topic has in a world."""
+        return replace(self, topic=world.node.resolve_topic_name(self.topic))
 
 
 @dataclass(frozen=True, repr=False)
@@ -55,7 +61,7 @@ class Repeated(_Arrival):
 
     def heard(self, topic: str, message: Any) -> list[tuple[float, Any]]:
         """Return the message twice."""
-        return [(0.0, message), (self.after, message)] if self._is_of(topic) else [(0.0, message)]
+        return [(0.0, message), (self.after, message)] if topic == self.topic else [(0.0, message)]
 
 
 @dataclass(frozen=True, repr=False)
@@ -79,11 +85,22 @@ class Late(_Arrival):
 
     def heard(self, topic: str, message: Any) -> list[tuple[float, Any]]:
         """Return the message with its delay."""
-        return [(self.seconds if self._is_of(topic) else 0.0, message)]
+        return [(self.seconds if topic == self.topic else 0.0, message)]
 
     def nearby(self) -> list[Imaging]:
         """Return none: between limits rounding decides nothing."""
         return []
+
+    def check(self, messages: Sequence[Message], namespace: str) -> None:
+        """Check that messages are late by less than their period."""
+        name = self.topic if self.topic.startswith('/') else full_name(namespace, self.topic)
+        times = [one.time for one in messages if one.speaker.topic == name]
+        gaps = sorted(after - before for before, after in pairwise(times) if after > before)
+        period = gaps[len(gaps) // 2] / NANOSECONDS if gaps else math.inf
+        if self.seconds >= period:
+            raise LockstepError(
+                f'{self!r}: seconds must be less than the period of {name}, which is {period:g} s'
+            )
 
     @property
     def early(self) -> float:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from diffdrive_jacobian.faults.fault import Expression, Fault
-from diffdrive_jacobian.lockstep._border import Endpoints
+from diffdrive_jacobian.lockstep._border import Endpoints, Message
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.numerics.checks import Positive
@@ -63,6 +63,13 @@ class Relation(Imaging, Expression, ABC):
         """
         # In one of a pair each number grows by what it shrinks by in the other.
         return [Perturbed(seed, sign, self.tolerance) for seed in range(PAIRS) for sign in (1, -1)]
+
+    def check(self, messages: Sequence[Message], namespace: str) -> None:
+        """Check that it can be compared with what was said in a world of a namespace.
+
+        Raises:
+            LockstepError: It cannot.
+        """
 
     def is_disturbed_by(self, fault: Fault) -> bool:
         """Return whether it need not hold with a fault. Both worlds are without it then."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from diffdrive_jacobian.faults import Fault
@@ -19,10 +19,10 @@ from diffdrive_jacobian.relations.differences import (
     exact,
     first_difference,
 )
-from diffdrive_jacobian.relations.images import Image, image_of, images
+from diffdrive_jacobian.relations.images import Image, check_image, image_made, image_of
 from diffdrive_jacobian.relations.imaging import Imaging
 from diffdrive_jacobian.relations.worlds import Ran, Scene, decoded
-from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds
+from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds, nanoseconds
 
 
 class RelationViolation(PropertyViolation):
@@ -51,6 +51,7 @@ class Checked(NamedTuple):
 
 
 UNTIL_ROUNDING = 'what came after an event that rounding decides was not compared'
+UNCHANGED = 'no message that the nodes under test hear is changed'
 UNTIL_OVERTAKEN = 'what came after a request or an end that overtook a late message was not compared'
 UNTIL_OTHERS = 'what came after a change of the other nodes was not compared'
 
@@ -67,15 +68,20 @@ def checked(relation: Relation, first: Ran, scene: Scene) -> Checked:
         LockstepError: There is no node under test, or an image cannot be made.
     """
     names = relation.under_test(first.nodes, first.namespace)
+    relation.check(first.messages, first.namespace)
     image = image_of(relation, first, scene, names)
     result = _compared(relation, first, image, names)
     seconds = image.ran.end / NANOSECONDS
-    if result.difference is None:
+    if result.difference is None or scene.debugged:
         return result._replace(seconds=seconds)
     decides, spent = _rounding_decides(relation, first, scene, names, result.difference)
     seconds += spent
     if decides:
-        return result._replace(difference=None, note=UNTIL_ROUNDING, seconds=seconds)
+        end = result.difference.time
+        count = sum(one.time < end for one in first.messages if one.speaker.node in names)
+        return result._replace(
+            difference=None, compared=count, end=end, note=UNTIL_ROUNDING, seconds=seconds
+        )
     return result._replace(seconds=seconds, digest=_digest(first, image.ran))
 
 
@@ -119,7 +125,7 @@ def _compared(imaging: Imaging, first: Ran, image: Image, names: Collection[str]
             end, note = others, UNTIL_OTHERS
     expected = _spoken(first, names, end, lambda one: _expected(imaging, first, one))
     apart = {imaging.renamed(name, first.namespace) for name in names}
-    actual = _spoken(ran, apart, end, lambda one: _actual(imaging, one))
+    actual = _spoken(ran, apart, end, lambda one: _actual(imaging, ran, one))
     found: list[Difference] = []
     if ran.error is not None and first.error is None and ran.end <= end:
         what = raised(ran.error) if isinstance(ran.error, Exception) else f'it raised {ran.error!r}'
@@ -140,9 +146,16 @@ def _compared(imaging: Imaging, first: Ran, image: Image, names: Collection[str]
         if until is not None and until < end:
             end, note = until, UNTIL_ROUNDING
     found = [one for one in found if one.time < end or (one.speaker is None and one.time == end)]
-    count = sum(one.time < end for spoken in expected.values() for one in spoken)
+    count = _count(expected, end - nanoseconds(max(imaging.early, imaging.late)))
+    if not image.changed:
+        count, note = 0, UNCHANGED
     topics = {one.speaker.topic for one in first.messages if one.speaker.node in names}
     return Checked(_first(found, ran), count, frozenset(topics), end, note=note)
+
+
+def _count(expected: Mapping[Speaker, Sequence[Spoken]], end: int) -> int:
+    """Return how many messages were said before a time (ns)."""
+    return sum(one.time < end for spoken in expected.values() for one in spoken)
 
 
 def _first(found: Sequence[Difference], image: Ran) -> Difference | None:
@@ -176,12 +189,16 @@ def _expected(imaging: Imaging, first: Ran, one: Message) -> tuple[Speaker, Any]
     message = decoded(one)
     if isinstance(message, bytes):
         return speaker, message
-    return speaker, images(imaging, topic, message, imaging.said)
+    image = image_made(imaging, topic, message, imaging.said)
+    check_image(imaging, topic, message, image)
+    return speaker, imaging.compared(image, first.namespace)
 
 
-def _actual(imaging: Imaging, one: Message) -> tuple[Speaker, Any]:
+def _actual(imaging: Imaging, ran: Ran, one: Message) -> tuple[Speaker, Any]:
     message = decoded(one)
-    return one.speaker, message if isinstance(message, bytes) else imaging.compared(message)
+    return one.speaker, message if isinstance(message, bytes) else imaging.compared(
+        message, ran.namespace
+    )
 
 
 def _change_of_others(first: Ran, image: Ran, names: Collection[str], tolerance: float) -> int:
@@ -227,8 +244,8 @@ def check_relation(
         faults: Faults of both worlds.
         seed: Seed of their random numbers.
         args: ROS arguments of all nodes, as for `Lockstep`.
-        pause_at: World time at which each of the worlds is paused for a debugger (s), as by
-            `Lockstep.pause_at`; None: none is.
+        pause_at: World time at which the world and its image are paused for a debugger (s), as by
+            `Lockstep.pause_at`. Whether rounding decides is not looked at then. None: they are not.
 
     Raises:
         PropertyViolation: What they say is not the image of what they said.
@@ -238,6 +255,11 @@ def check_relation(
     if not isinstance(given, Relation):
         hint = f'; create one: {given.__name__}()' if isinstance(given, type) else ''
         raise LockstepError(f'check_relation takes a relation, got {described(given)}{hint}')
+
+    if not callable(scenario):
+        raise LockstepError(f'scenario must be a function (world, case), got {described(scenario)}')
+    if not isinstance(faults, (list, tuple)):
+        raise LockstepError(f'faults must be a list, got {described(faults)}')
 
     def paused(world: Lockstep, what: str) -> None:
         if pause_at is not None:
@@ -250,8 +272,9 @@ def check_relation(
         seed=seed,
         args=args,
         on_world=paused,
+        debugged=pause_at is not None,
     )
-    first = scene.run('the first world')
+    first = scene.run('the first world', strict=True)
     if first.error is not None:
         raise first.error
     result = checked(relation, first, scene)

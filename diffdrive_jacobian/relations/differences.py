@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise, zip_longest
+from itertools import pairwise, takewhile, zip_longest
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -29,6 +29,7 @@ STAMP_TOLERANCE = 1000
 """Largest difference of times in messages (ns): they may have been floats."""
 SHOWN = 3
 """Number of fields that a difference names."""
+FIRST, IMAGE = 'in the first world', 'in the image'
 QUATERNION = 'geometry_msgs/Quaternion'
 
 
@@ -72,7 +73,7 @@ def differing(one: Any, other: Any, tolerance: float, late: int = 0) -> list[str
             break
         path, kind, value = mine
         if not _close(kind, value, theirs[2], tolerance, late):
-            found.append(f'{path} is {_shown(kind, value)}, expected {_shown(kind, theirs[2])}')
+            found.append(f'{_named(path)} {_shown(kind, value)}, expected {_shown(kind, theirs[2])}')
     return found
 
 
@@ -197,11 +198,8 @@ def _once(spoken: Sequence[Spoken], tolerance: float) -> list[Spoken]:
     """Leave out what is said again at the same time."""
     kept: list[Spoken] = []
     for one in spoken:
-        if not (
-            kept
-            and kept[-1].time == one.time
-            and not differing(one.message, kept[-1].message, tolerance)
-        ):
+        same = takewhile(lambda other: other.time == one.time, reversed(kept))  # noqa: B023
+        if all(differing(one.message, other.message, tolerance) for other in same):
             kept.append(one)
     return kept
 
@@ -240,14 +238,14 @@ def _outside(
         if one.time + early >= end:
             break
         near = _around(expected, one.time - late, one.time + early)
-        if text := _not_between(one, near, tolerance, early + late):
-            found.append(Difference(one.time, f'{text} around this time'))
+        if text := _not_between(one, near, tolerance, early + late, IMAGE, FIRST):
+            found.append(Difference(one.time, text))
     for one in expected:
         if one.time + late >= end:
             break
         near = _around(image, one.time - early, one.time + late)
-        if text := _not_between(one, near, tolerance, early + late):
-            found.append(Difference(one.time, f'{text} in the image around this time'))
+        if text := _not_between(one, near, tolerance, early + late, FIRST, IMAGE):
+            found.append(Difference(one.time, text))
     if not found:
         return None
     first = min(found, key=lambda difference: difference.time)
@@ -261,22 +259,56 @@ def _around(spoken: Sequence[Spoken], first: int, last: int) -> Sequence[Spoken]
     return spoken[begin : bisect_right(spoken, last, key=attrgetter('time'))]
 
 
-def _not_between(one: Spoken, near: Sequence[Spoken], tolerance: float, late: int) -> str:
-    """Return why a message is not between others; '': it is."""
+def _not_between(
+    one: Spoken, near: Sequence[Spoken], tolerance: float, late: int, here: str, there: str
+) -> str:
+    """Return why a message is not between others; '': it is. `here` and `there` say where they are."""
     if not near:
-        return f'{brief(one.message)}, and nothing is said'
+        return f'{brief(one.message)} {here}, and nothing {there} around this time'
     if any(not differing(two.message, one.message, tolerance, late) for two in near):
         return ''
     others = [{path: value for path, _, value in _fields(two.message)} for two in near]
     for path, kind, value in _fields(one.message):
         values = [other[path] for other in others if path in other]
-        if isinstance(kind, Number) and kind.is_float:
-            low, high = min(values, default=math.nan), max(values, default=math.nan)
+        if any(_close(kind, value, other, tolerance, late) for other in values):
+            continue
+        numbers, series = _numbers(kind, value), [_numbers(kind, other) for other in values]
+        series = [other for other in series if len(other) == len(numbers)]
+        if not numbers or not series:
+            return f'{_named(path)} {_shown(kind, value)} {here}, another one {there} around this time'
+        if isinstance(kind, Structure):
+            series = [_aligned(other, numbers) for other in series]
+        for index, number in enumerate(numbers):
+            along = [other[index] for other in series]
             # An event that comes one message earlier cuts off the last step before it.
-            step = max((abs(after - before) for before, after in pairwise(values)), default=0.0)
-            margin = step + tolerance * max(1.0, abs(value))
-            if not low - margin <= value <= high + margin:
-                return f'{path} is {value:.9g}, expected from {low:.9g} to {high:.9g}, as it is said'
-        elif not any(_close(kind, value, other, tolerance, late) for other in values):
-            return f'{path} is {_shown(kind, value)}, expected what is said'
+            step = max((abs(after - before) for before, after in pairwise(along)), default=0.0)
+            margin = step + tolerance * max(1.0, abs(number))
+            if not min(along) - margin <= number <= max(along) + margin:
+                return (
+                    f'{_named(path)} {number:.9g} {here}, '
+                    f'from {min(along):.9g} to {max(along):.9g} {there} around this time'
+                )
     return ''
+
+
+def _numbers(kind: FieldType, value: Any) -> Sequence[float]:
+    """Return the numbers of a field that may lie between others. One byte has a meaning, and may not."""
+    match kind:
+        case Structure(name=name) if name == QUATERNION:
+            return _quaternion(value)
+        case Number() if kind.size > 1:
+            return [value]
+        case Array(Number() as element) | SequenceType(Number() as element) if element.size > 1:
+            return tuple(plain(value))
+    return ()
+
+
+def _aligned(quaternion: Sequence[float], other: Sequence[float]) -> Sequence[float]:
+    """Return that of the two quaternions of a rotation which is nearer to another one."""
+    product = sum(one * two for one, two in zip(quaternion, other, strict=True))
+    return quaternion if product >= 0.0 else [-one for one in quaternion]
+
+
+def _named(path: str) -> str:
+    """Return the beginning of what is said of a field, or of a message that is one value."""
+    return f'{path} is' if path else 'it is'

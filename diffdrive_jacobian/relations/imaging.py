@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+from diffdrive_jacobian.lockstep.world import Lockstep
+
 
 class Imaging:
     """What makes the image of a world. By default it is the same. Base class of relations.
@@ -19,6 +21,10 @@ class Imaging:
     whole_world: ClassVar[bool] = False
     """Whether all nodes run again, and hear each other."""
 
+    def in_world(self, world: Lockstep) -> Imaging:
+        """Return it with the full names that its topics have in a world."""
+        return self
+
     def heard(self, topic: str, message: Any) -> list[tuple[float, Any]]:
         """Return what a node under test hears instead of a message: messages with their delays (s)."""
         return [(0.0, message)]
@@ -31,8 +37,8 @@ class Imaging:
         """Return the full name of a node or a topic in the image of a world in a namespace."""
         return name
 
-    def compared(self, message: Any) -> Any:
-        """Return what a node under test has said as it is compared."""
+    def compared(self, message: Any, namespace: str) -> Any:
+        """Return what a node has said in a world of a namespace as it is compared."""
         return message
 
     @property

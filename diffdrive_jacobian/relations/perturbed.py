@@ -8,8 +8,8 @@ from typing import Any
 from diffdrive_jacobian.messages.structure import Array, Number, Sequence, parts
 from diffdrive_jacobian.relations.imaging import Imaging
 
-AMPLITUDES = {'d': 1e-9, 'f': 1e-7}
-"""Changes of numbers, relative to those above 1, by the code of their type."""
+AMPLITUDES = {'d': (1e-9, 1e-12), 'f': (1e-7, 1e-7)}
+"""Changes of numbers, by the code of their type: the least, and relative to the number."""
 
 
 class Perturbed(Imaging):
@@ -34,5 +34,6 @@ class Perturbed(Imaging):
         return [(0.0, message)]
 
     def _changed(self, value: float, code: str) -> float:
-        change = AMPLITUDES[code] * self._random.uniform(0.5, 1.0) * self._random.choice((-1, 1))
-        return value + self._sign * change * max(1.0, abs(value))
+        least, relative = AMPLITUDES[code]
+        change = self._random.uniform(0.5, 1.0) * self._random.choice((-1, 1))
+        return value + self._sign * change * max(least, relative * abs(value))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
@@ -12,8 +12,8 @@ from rclpy.validate_namespace import validate_namespace
 from diffdrive_jacobian.faults import Fault
 from diffdrive_jacobian.lockstep._border import Endpoints
 from diffdrive_jacobian.messages.conversion import set_time
-from diffdrive_jacobian.messages.structure import Text, parts
-from diffdrive_jacobian.numerics.checks import Positive, nonempty
+from diffdrive_jacobian.messages.structure import Array, Sequence, Text, parts
+from diffdrive_jacobian.numerics.checks import Positive, between, nonempty
 from diffdrive_jacobian.relations.base import Relation
 from diffdrive_jacobian.relations.imaging import Imaging
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
@@ -24,6 +24,8 @@ LITTLE = 1.0, 2.0, 3.0, 5.0, 7.0, 11.0
 """Times by which worlds are later that show whether rounding decides (s)."""
 COARSE = 100.0
 """Their tolerance, relative to that of the relation. Rounding that decides moves more than numbers."""
+LATEST = 1e9
+"""Latest start: clocks end 68 years after they begin (s)."""
 TIME = 'builtin_interfaces/Time'
 
 
@@ -53,7 +55,7 @@ class Shifted(WholeWorld):
             time, nothing is compared.
     """
 
-    seconds: Positive = 1000.0
+    seconds: Annotated[float, between(0.0, LATEST, unit='s')] = 1000.0
     period: Positive = field(default=0.1, kw_only=True)
 
     @property
@@ -85,8 +87,10 @@ class Shifted(WholeWorld):
 
 def _namespace(name: str, value: Any) -> str:
     """Require a namespace, such as /robot1."""
-    full = f'/{str(nonempty(name, value)).lstrip("/")}'
+    full = f'/{str(nonempty(name, value)).strip("/")}'
     try:
+        if full == '/':
+            raise ValueError(f"{name} must be a namespace such as '/robot1', got {value!r}")
         validate_namespace(full)
     except InvalidNamespaceException as error:
         why = str(error).splitlines()[0].rstrip(':')
@@ -132,11 +136,18 @@ class Renamed(WholeWorld):
         """Return the full name of a node or a topic in the image."""
         return name if name in GLOBAL else self.namespace + name.removeprefix(namespace.rstrip('/'))
 
-    def compared(self, message: Any) -> Any:
-        """Return a message without the namespace in its texts."""
+    def compared(self, message: Any, namespace: str) -> Any:
+        """Return a message without the namespace in its texts, and without the slash before a name."""
+        prefixes = (f'{namespace.rstrip("/")}/', f'{namespace.strip("/")}/', '/')
+
+        def without(text: str) -> str:
+            return next((text.removeprefix(one) for one in prefixes if text.startswith(one)), text)
+
         for kind, part in parts(message):
             for name, one in kind.fields:
-                if isinstance(one, Text):
-                    text = getattr(part, name).removeprefix(f'{self.namespace}/')
-                    setattr(part, name, text.removeprefix(f'{self.namespace[1:]}/'))
+                match one:
+                    case Text():
+                        setattr(part, name, without(getattr(part, name)))
+                    case Array(Text()) | Sequence(Text()):
+                        setattr(part, name, [without(text) for text in getattr(part, name)])
         return message

@@ -11,6 +11,7 @@ from rclpy.serialization import deserialize_message
 
 from diffdrive_jacobian.faults import Fault
 from diffdrive_jacobian.lockstep._border import Endpoints, Message, Said
+from diffdrive_jacobian.lockstep._pause import ends_all
 from diffdrive_jacobian.lockstep.world import Lockstep
 
 START = 1.0
@@ -48,9 +49,17 @@ class Scene:
     args: Sequence[str] = ()
     on_world: Callable[[Lockstep, str], object] = lambda *_: None
     """Called with each world, and what it is."""
+    debugged: bool = False
+    """Whether somebody looks into the worlds."""
 
     def run(
-        self, what: str, listen: Listen = Said, *, args: Sequence[str] = (), later: float = 0.0
+        self,
+        what: str,
+        listen: Listen = Said,
+        *,
+        args: Sequence[str] = (),
+        later: float = 0.0,
+        strict: bool = False,
     ) -> Ran:
         """Run it, and return what was said.
 
@@ -59,6 +68,7 @@ class Scene:
             listen: What listens to it.
             args: ROS arguments before those of the scene.
             later: How much later the clocks show at the start (s).
+            strict: Whether a fault that meets nothing is an error.
         """
         with Lockstep([*args, *self.args], start=START + later) as world:
             self.on_world(world, what)
@@ -67,9 +77,11 @@ class Scene:
                 try:
                     self.scenario(world, self.case)
                     world.settle()
-                except KeyboardInterrupt:
-                    raise
+                    if strict:
+                        world.check_faults()
                 except BaseException as error:
+                    if ends_all(error):
+                        raise
                     return Ran.of(world, said, error)
                 return Ran.of(world, said)
 

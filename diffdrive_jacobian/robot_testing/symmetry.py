@@ -21,12 +21,12 @@ from diffdrive_jacobian.messages.structure import Structure, structure
 from diffdrive_jacobian.numerics.checks import Finite
 from diffdrive_jacobian.relations.base import Relation
 
-OF_ROBOT = ('base_link', 'base_footprint')
-"""Frames of a robot, without a prefix: what is given in them is where it is, seen from the robot."""
+FIXED = ('map', 'odom', 'world', 'earth')
+"""Default names of the frames that do not move with a robot, without a prefix."""
 POSES = ('geometry_msgs/Pose', 'geometry_msgs/Transform')
 TWISTS = ('geometry_msgs/Twist', 'geometry_msgs/Accel', 'geometry_msgs/Wrench')
 POINTS = ('geometry_msgs/Point', 'geometry_msgs/Point32')
-WITHOUT = ('nav_msgs/OccupancyGrid', 'nav_msgs/MapMetaData')
+WITHOUT = ('nav_msgs/OccupancyGrid', 'nav_msgs/MapMetaData', 'geometry_msgs/Inertia')
 """Types without an image, beside those of sensor_msgs."""
 
 
@@ -37,9 +37,12 @@ class PlaneRelation(Relation):
     Attributes:
         commands: Topic of the commands. The nodes under test are those that publish it, unless `node`
             names one.
+        fixed: Frames that do not move with a robot, without a prefix. What is given in another one is
+            seen from the robot. What has no frame is not.
     """
 
     commands: RosName = field(default='cmd_vel', kw_only=True)
+    fixed: tuple[str, ...] = field(default=FIXED, kw_only=True)
 
     def under_test(self, nodes: Mapping[str, Endpoints], namespace: str) -> set[str]:
         """Return the nodes that publish commands."""
@@ -58,11 +61,11 @@ class PlaneRelation(Relation):
         """Change a message, or a part of one, which is given in the frame of a robot if `of_robot`."""
         frame = getattr(getattr(message, 'header', None), 'frame_id', '')
         if frame:
-            of_robot = frame.rpartition('/')[2] in OF_ROBOT
+            of_robot = not self._is_fixed(frame)
         match kind.name:
             case 'geometry_msgs/TransformStamped':
-                child = message.child_frame_id.rpartition('/')[2] in OF_ROBOT
-                self._transform(message.transform, of_robot=of_robot, to_robot=child)
+                to_robot = not self._is_fixed(message.child_frame_id)
+                self._transform(message.transform, of_robot=of_robot, to_robot=to_robot)
             case name if name in POSES:
                 position = message.position if hasattr(message, 'position') else message.translation
                 orientation = getattr(message, 'orientation', None) or message.rotation
@@ -74,8 +77,9 @@ class PlaneRelation(Relation):
             case 'geometry_msgs/PoseWithCovariance':
                 self._change(_type(kind, 'pose'), message.pose, topic, of_robot=of_robot)
                 message.covariance = self._covariance(message.covariance, of_robot=of_robot)
-            case 'geometry_msgs/TwistWithCovariance':
-                self._change(_type(kind, 'twist'), message.twist, topic, of_robot=of_robot)
+            case 'geometry_msgs/TwistWithCovariance' | 'geometry_msgs/AccelWithCovariance':
+                inner = getattr(message, kind.fields[0][0])
+                self._twist(inner.linear, inner.angular)
                 message.covariance = self._covariance(message.covariance, of_robot=True)
             case name if name in TWISTS:
                 first, second = (getattr(message, one) for one, _ in kind.fields)
@@ -102,6 +106,9 @@ class PlaneRelation(Relation):
                         ):
                             for part in value:
                                 self._change(element, part, topic, of_robot=of_robot)
+
+    def _is_fixed(self, frame: str) -> bool:
+        return frame.rpartition('/')[2] in self.fixed
 
     @abstractmethod
     def _point(self, point: Any, *, of_robot: bool) -> None:
@@ -136,8 +143,7 @@ class PlaneRelation(Relation):
 class Moved(PlaneRelation):
     """Elsewhere in the plane the robot is driven in the same way: the commands are equal.
 
-    Positions and headings are turned about the origin by `theta`, then moved by `x` and `y`. Those in a
-    frame `base_link` or `base_footprint` stay.
+    Positions and headings are turned about the origin by `theta`, then moved by `x` and `y`.
 
     Attributes:
         x: (m)
@@ -172,7 +178,8 @@ class Moved(PlaneRelation):
     def _pose_2d(self, pose: Any, *, of_robot: bool) -> None:
         if not of_robot:
             self._point(pose, of_robot=False)
-            pose.theta = math.remainder(pose.theta + self.theta, math.tau)
+            if math.isfinite(pose.theta):
+                pose.theta = math.remainder(pose.theta + self.theta, math.tau)
 
     def _twist(self, linear: Any, angular: Any) -> None:
         """It stays."""
@@ -194,23 +201,22 @@ class Moved(PlaneRelation):
         return turned
 
     def _transform(self, transform: Any, *, of_robot: bool, to_robot: bool) -> None:
-        if of_robot:
-            return
         if not to_robot:
-            # Between two frames that do not move with a robot, both of which are moved: back first.
             self._move_back(transform)
-        self._point(transform.translation, of_robot=False)
-        self._rotation(transform.rotation, of_robot=False)
+        self._point(transform.translation, of_robot=of_robot)
+        self._rotation(transform.rotation, of_robot=of_robot)
 
     def _move_back(self, transform: Any) -> None:
-        """Let a transform begin where the other frame is not moved yet."""
-        q, shift = transform.rotation, transform.translation
-        yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2)) - self.theta
-        c, s = math.cos(yaw), math.sin(yaw)
-        shift.x -= c * self.x - s * self.y
-        shift.y -= s * self.x + c * self.y
-        back = Moved(0.0, 0.0, -self.theta)
-        back._rotation(q, of_robot=False)
+        """Let a transform lead to a frame that has moved: the opposite motion comes after it."""
+        shift, q = transform.translation, transform.rotation
+        c, s = math.cos(-self.theta / 2.0), math.sin(-self.theta / 2.0)
+        x, y, z, w = c * q.x + s * q.y, c * q.y - s * q.x, c * q.z + s * q.w, c * q.w - s * q.z
+        q.x, q.y, q.z, q.w = x, y, z, w
+        along_x = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w)
+        along_y = 2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w)
+        shift.x -= along_x[0] * self.x + along_y[0] * self.y
+        shift.y -= along_x[1] * self.x + along_y[1] * self.y
+        shift.z -= along_x[2] * self.x + along_y[2] * self.y
 
 
 @dataclass(frozen=True, repr=False)

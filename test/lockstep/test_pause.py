@@ -78,7 +78,7 @@ def test_who_stops_may_step_publish_and_pass_the_end(lockstep, stops):
     assert len(node.ticks) == 14
 
 
-def test_a_violation_at_the_prompt_is_raised_there(lockstep, stops):
+def test_a_violation_at_the_prompt_is_raised_there_and_afterwards(lockstep, stops):
     lockstep.create(lambda: Blinker(rate=10.0))
     lockstep.require(FieldWithin('blink', 'nanosec', 0.0, 2.5e8))
 
@@ -88,7 +88,8 @@ def test_a_violation_at_the_prompt_is_raised_there(lockstep, stops):
 
     stops.act = act
     lockstep.pause_at(0.3)
-    lockstep.run_for(1.0)
+    with pytest.raises(PropertyViolation, match='is violated at'):
+        lockstep.run_for(1.0)
     assert len(stops) == 1
 
 
@@ -134,7 +135,7 @@ def test_each_world_of_a_relation_stops(stops):
     check_relation(blinking, Repeated('blink'), pause_at=0.2)
     assert [header.partition(' is')[0] for _, header in stops] == [
         *('the first world', 'the first world'),
-        'the image',
+        "the image of Repeated('blink')",
     ]
 
 

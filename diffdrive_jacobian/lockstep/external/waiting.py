@@ -72,7 +72,7 @@ class Waiting:
                 )
             raise LockstepError(
                 f'{discovery.names} {error}\n  {remedy}; a callback that takes longer: '
-                f'start(..., patience=)\n{domain.child.describe()}'
+                f'start(..., patience=); a debugger: pause_at\n{domain.child.describe()}'
             ) from None
 
     def _asks(self) -> bool:
