@@ -101,8 +101,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._goal: ActiveGoal | None = None
         self._goals_received = 0
         self._state = State((0, 0), '', (0.0, 0.0, 0.0), STANDSTILL)
-        # Stamp of odometry that was older than the last; None: the last was newer than that before.
-        self._older: tuple[int, int] | None = None
+        # Whether the last odometry was ignored because it was older than that before.
+        self._was_older = False
         self._rate = OdometryRate()
         # Whether the last command makes the robot move: it outlives a goal that is replaced.
         self._driving = False
@@ -154,7 +154,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         stale = goal is not None and goal.stale
         if state.stamp <= self._state.stamp and self._is_old(state) and not stale:
             return
-        self._state, self._older = state, None
+        self._state, self._was_older = state, False
         if goal is None:
             return
         self._watchdog.feed(now)
@@ -185,15 +185,15 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     def _is_old(self, state: State) -> bool:
         """Return whether odometry that is not newer than the last comes again, or out of order.
 
-        Not if its stamps do not tell: they are zero, or equal while the robot moves. If what comes next
-        is not newer either, but newer than this, its source has started again, or the clock was reset.
+        Not if its stamps do not tell: they are zero, or equal while the robot moves. After two that are
+        older, its source has started again, or the clock was reset.
         """
         if state.stamp == (0, 0):
             return False
-        before, self._older = self._older, state.stamp
         if state.stamp == self._state.stamp:
             return state == self._state
-        if before is not None and state.stamp > before:
+        before, self._was_older = self._was_older, True
+        if before:
             return False
         self.log_event_warning(
             'odometry is old',

@@ -22,6 +22,7 @@ from support.lockstep_nodes import (
 from support.ros_messages import goal, goals, odometry, spoiled, twists
 
 from diffdrive_jacobian.control import VelocityLimits, saturate
+from diffdrive_jacobian.messages.conversion import set_time
 
 
 @pytest.fixture
@@ -251,3 +252,43 @@ def test_a_new_goal_does_not_put_the_timeout_off_and_turns_in_place_are_stopped_
     lockstep.run_for(1000.0)
     assert controller.at(-1, 0) == (0.0, 0.0)
     assert controller.statuses[-2:] == [(0, EXECUTING), (0, SUCCEEDED)]
+
+
+# --- Odometry that comes again, or out of order
+
+
+def stamped(seconds, x):
+    message = odometry(x, 0, 0)
+    set_time(message.header.stamp, round(seconds * 1e9))
+    return message
+
+
+@pytest.mark.parametrize(
+    ('stamps', 'answered'),
+    [
+        ([5.0, 5.02, 5.02, 5.04], [1, 1, 0, 1]),
+        # Of another pose with an equal stamp: the stamps are coarse.
+        ([(5.0, 0.0), (5.0, 0.1), (5.0, 0.2)], [1, 1, 1]),
+        ([5.0, 5.1, 5.02, 5.12, 5.04, 5.14], [1, 1, 0, 1, 0, 1]),
+        # The source has started again, or counts down.
+        ([5.0, 1.0, 1.02, 1.04], [1, 0, 1, 1]),
+        ([5.0, 4.9, 4.8, 4.7], [1, 0, 1, 0]),
+        ([(0.0, 0.1), (0.0, 0.1)], [1, 1]),
+        ([(5.0, 0.1), (0.0, 0.1), (5.0, 0.2)], [1, 1, 1]),
+    ],
+)
+def test_odometry_that_comes_again_or_out_of_order_is_ignored(controller, stamps, answered):
+    controller.send(goal(1, 0))
+    pairs = [one if isinstance(one, tuple) else (one, one / 100.0) for one in stamps]
+    assert [len(controller.sees(stamped(*pair))) for pair in pairs] == answered
+
+
+def test_the_robot_is_stopped_if_its_odometry_only_comes_again(lockstep, controller, capfd):
+    controller.send(goal(1, 0))
+    assert controller.sees(stamped(5.0, 0.1)) != []
+    for _ in range(8):
+        lockstep.run_for(0.1)
+        controller.sees(stamped(5.0, 0.1))
+    assert (0.0, 0.0) in twists(controller.commands)
+    controller.sees(stamped(4.0, 0.1))
+    assert 'it is older than the last one' in capfd.readouterr().err

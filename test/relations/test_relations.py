@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import pickle
+from bdb import BdbQuit
 from dataclasses import dataclass
 
 import pytest
-from geometry_msgs.msg import Vector3
+from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped
+from rclpy.node import Node
 from relation_nodes import (
     Answer,
     Echo,
@@ -18,10 +20,11 @@ from relation_nodes import (
     impatient,
     previous,
     scene,
+    seconds,
     side,
     total,
 )
-from std_msgs.msg import String
+from std_msgs.msg import Float64MultiArray, Int32, String, UInt8
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian import relations
@@ -130,6 +133,77 @@ def test_a_violation_is_one_of_a_property():
     assert str(violation).startswith("Repeated('number') is violated at 0 s: /answer on /answer: ")
     assert (violation.property, violation.seconds) == (Repeated('number'), 0.0)
     assert pickle.loads(pickle.dumps(violation)).text == violation.text
+
+
+def test_a_node_that_speaks_first_is_compared():
+    """Whose timer ticks before anybody else has said anything."""
+
+    def ticking(world, case):
+        world.create(Source)
+        world.run_for(0.5)
+
+    ticks = Late('nothing', node='source'), Repeated('nothing', node='source')
+    for relation in ticks:
+        assert result(relation, ticking).compared == 0
+    assert result(Shifted(), ticking).compared == 6
+
+
+def test_numbers_between_others_are_late_as_they_may_be():
+    """Also in arrays, as integers, and as the components of a quaternion."""
+
+    def turning(world, case):
+        node = world.create(Source)
+        other = world.create(lambda: Node('turning', start_parameter_services=False))
+        quaternions = other.create_publisher(Quaternion, 'turn', 10)
+        arrays = other.create_publisher(Float64MultiArray, 'array', 10)
+        counts = other.create_publisher(Int32, 'count', 10)
+        bytes_ = other.create_publisher(UInt8, 'byte', 10)
+        heard = []
+        other.create_subscription(Vector3Stamped, 'number', heard.append, 10)
+
+        def tick():
+            half = 0.05 * (seconds(heard[-1]) if heard else 1.0)
+            quaternions.publish(Quaternion(z=math.sin(half), w=math.cos(half)))
+            arrays.publish(Float64MultiArray(data=[half, -half]))
+            counts.publish(Int32(data=int(100 * half)))
+            bytes_.publish(UInt8(data=case(half)))
+
+        other.create_timer(0.15, tick)
+        world.run_for(2.0)
+        assert node.count
+
+    late = Late('number', 0.06, period=0.2)
+    check_relation(turning, late, case=lambda half: 7, args=QUIET)
+    with pytest.raises(PropertyViolation, match='/turning on /byte: data is'):
+        check_relation(turning, late, case=lambda half: int(1000 * half), args=QUIET)
+
+
+def test_what_is_said_in_turns_counts_once():
+    def both(node, message):
+        node.publisher.publish(Vector3(x=1.0, y=message.vector.x))
+        return 2.0
+
+    assert result(Repeated('number'), scene(both)).difference is None
+
+
+def test_a_topic_is_that_of_its_full_name():
+    """Not one that ends likewise, which the node hears, too."""
+
+    def two(world, case):
+        node = world.create(lambda: Answer(total))
+        node.create_subscription(Vector3Stamped, 'wheel/number', node.on_number, 10)
+        world.create(Source)
+        wheel = world.node.create_publisher(Vector3Stamped, 'wheel/number', 10)
+        for _ in range(3):
+            world.run_for(0.1)
+            message = Vector3Stamped()
+            message.vector.x = 5.0
+            wheel.publish(message)
+            world.settle()
+
+    assert '/answer' in result(Repeated('number'), two).difference.text
+    wheel = result(Repeated('wheel/number'), two).difference
+    assert wheel.time == 100_000_000
 
 
 # --- What is not
@@ -256,6 +330,16 @@ class Wrong(Relation):
         return {'None': None, 'error': lambda: 1 // 0, 'type': Vector3()}[self.kind] or 1 // 0
 
 
+@dataclass(frozen=True, repr=False)
+class Heard(Negated):
+    """Is heard in no right way."""
+
+    kind: str = ''
+
+    def heard(self, topic, message):
+        return {'pair': message, 'delay': [(-1.0, message)], 'type': [(0.0, Vector3())]}[self.kind]
+
+
 @pytest.mark.parametrize(
     ('relation', 'text'),
     [
@@ -267,11 +351,43 @@ class Wrong(Relation):
         (Wrong(node='answer'), 'image of a message of /number: it raised ZeroDivisionError'),
         (Wrong('type', node='answer'), 'must be a Vector3Stamped, got'),
         (Late, r'check_relation takes a relation, got .*create one: Late\(\)'),
+        (Late('number', 0.1), 'seconds must be less than the period of /number, which is 0.1 s'),
+        (Heard('pair', node='answer'), 'heard must return a list of pairs'),
+        (Heard('delay', node='answer'), 'heard must return a list of pairs'),
+        (Heard('type', node='answer'), 'must be a Vector3Stamped, got'),
     ],
 )
 def test_misuse_is_an_error(relation, text):
     with pytest.raises(LockstepError, match=text):
         check_relation(scene(), relation, args=QUIET)
+
+
+def test_arguments_and_faults_are_checked():
+    with pytest.raises(LockstepError, match='scenario must be a function'):
+        check_relation(3, NEGATED)
+    with pytest.raises(LockstepError, match='faults must be a list'):
+        check_relation(scene(), NEGATED, faults=Loss('number'))
+    with pytest.raises(LockstepError, match='no subscription of /numer was seen'):
+        check_relation(scene(), NEGATED, faults=[Loss('numer')], args=QUIET)
+    for namespace in ('/', ''):
+        with pytest.raises(ValueError, match='Renamed: namespace must be'):
+            Renamed(namespace)
+    with pytest.raises(ValueError, match='Shifted: seconds must be in'):
+        Shifted(1e12)
+
+
+def test_who_quits_the_debugger_ends_all():
+    def quitting(world, case):
+        quits.append(world)
+        scene()(world, case)
+        if len(quits) > case:
+            raise BdbQuit
+
+    for number in (0, 1):
+        quits = []
+        with pytest.raises(BdbQuit):
+            check_relation(quitting, NEGATED, case=number, args=QUIET)
+        assert len(quits) == number + 1
 
 
 def test_that_nothing_was_said_is_an_error():

@@ -11,6 +11,7 @@ from geometry_msgs.msg import (
     PointStamped,
     PolygonStamped,
     Pose,
+    Pose2D,
     PoseArray,
     PoseStamped,
     PoseWithCovarianceStamped,
@@ -129,14 +130,13 @@ def test_twists_are_those_of_the_robot():
         ('robot/odom', 'robot/base_footprint', lambda before: MOVE @ before),
         ('map', 'odom', lambda before: MOVE @ before @ np.linalg.inv(MOVE)),
         ('base_link', 'laser', lambda before: before),
+        ('odom', 'chassis', lambda before: MOVE @ before),
+        ('laser', 'map', lambda before: before @ np.linalg.inv(MOVE)),
     ],
 )
 def test_a_transform_is_moved_by_its_frames(parent, child, expected):
     def message():
-        flat = TransformStamped(header=Header(frame_id=parent), child_frame_id=child)
-        flat.transform.translation.x, flat.transform.translation.y = 0.4, 2.0
-        flat.transform.rotation.z, flat.transform.rotation.w = math.sin(0.3), math.cos(0.3)
-        return flat
+        return filled(TransformStamped(header=Header(frame_id=parent), child_frame_id=child))
 
     before = of_transform(message().transform)
     moved = MOTION.image('tf', message()).transform
@@ -176,6 +176,7 @@ def test_an_image_of_an_image_may_be_the_message(kind):
 def test_what_is_not_finite_stays():
     pose = Pose(position=Point(x=math.nan, y=1.0))
     assert MOTION.image('goal', pose).position.y == 1.0
+    assert MOTION.image('goal', Pose2D(theta=math.inf)).theta == math.inf
 
 
 @pytest.mark.parametrize('kind', [LaserScan, OccupancyGrid])
