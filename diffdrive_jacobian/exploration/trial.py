@@ -256,16 +256,17 @@ def _with_images(
     outcome: Outcome, relations: Mapping[int, Relation], first: Ran, scene: Scene
 ) -> Outcome:
     """Add to the outcome of a world how its images compare with it."""
-    worlds = {tuple(scene.faults): (first, scene)}
+    worlds: dict[tuple[int, ...], tuple[Ran, Scene]] = {(): (first, scene)}
     for index, relation in relations.items():
-        faults = tuple(one for one in scene.faults if not relation.is_disturbed_by(one))
+        without = tuple(n for n, one in enumerate(scene.faults) if relation.is_disturbed_by(one))
         try:
-            if faults not in worlds:
+            if without not in worlds:
+                faults = [one for n, one in enumerate(scene.faults) if n not in without]
                 undisturbed = replace(scene, faults=faults)
                 ran = undisturbed.run('the world without faults that disturb the relation')
-                worlds[faults] = ran, undisturbed
+                worlds[without] = ran, undisturbed
                 outcome = replace(outcome, seconds=outcome.seconds + ran.end / NANOSECONDS)
-            result = checked(relation, *worlds[faults])
+            result = checked(relation, *worlds[without])
         except LockstepError as error:
             complaint = str(error).partition('\n')[0]
             outcome = replace(outcome, complaints=(*outcome.complaints, complaint))

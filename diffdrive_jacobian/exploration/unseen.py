@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from rclpy.exceptions import InvalidHandle
 
 from diffdrive_jacobian.faults import Fault, ParameterChange
-from diffdrive_jacobian.lockstep._border import Endpoints, endpoints_of
+from diffdrive_jacobian.lockstep._border import Endpoints, endpoints_of, topics_of
 from diffdrive_jacobian.lockstep._injection import absolute_name
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
@@ -59,15 +59,14 @@ class Watcher:
                 faulted.add(node)
                 if isinstance(one, ParameterChange):
                     changed.add((node, one.name))
-        said = {source.topic for _, source in self._world._scheduler.links.sources()}
-        observed = frozenset(self._world._properties.observed)
+        said, observed = topics_of(self._world)
         return Seen(
-            self._nodes,
-            frozenset(said),
-            observed,
-            frozenset(faulted),
-            frozenset(changed),
-            self._parameters(),
+            nodes=self._nodes,
+            said=said,
+            observed=observed,
+            faulted=frozenset(faulted),
+            changed=frozenset(changed),
+            parameters=self._parameters(),
         )
 
     def _parameters(self) -> dict[tuple[str, str], str]:

@@ -72,6 +72,12 @@ def endpoints_of(world: Lockstep) -> dict[str, Endpoints]:
     return found
 
 
+def topics_of(world: Lockstep) -> tuple[frozenset[str], frozenset[str]]:
+    """Return the topics with messages, and those that properties observe, by their full names."""
+    said = {source.topic for _, source in world._scheduler.links.sources()}
+    return frozenset(said), frozenset(world._properties.observed)
+
+
 class Said:
     """What all nodes of a world say while this context manager is open."""
 
