@@ -73,8 +73,8 @@ def explore(
         scenario: `scenario(world, case)` creates nodes in a `Lockstep` and advances its time. A function
             at the top level of a module. The faults are injected before, and the properties required.
         properties: What must hold, such as `[StopsAfterLostOdometry(1.0)]`.
-        relations: How each world must compare with its image, such as `[Mirrored()]`. An image, and each
-            world that rounding needs, is run besides.
+        relations: How each world must compare with its image, such as `[Mirrored()]`. The image, and
+            further worlds that show whether rounding matters, are run in addition.
         cases: Strategies by name, such as `{'start': poses(), 'goal': goals()}`. The case is then a dict
             with these keys. A single strategy: the case is its value. None: the case is None.
         faults: Strategy of lists of faults, such as `fault_schedules(['odom'])`; None: no faults.

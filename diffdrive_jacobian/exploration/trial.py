@@ -235,7 +235,8 @@ def run(
                     if not isinstance(getattr(error, 'property', None), _Collecting):
                         violations.append(of_exception(error, world.world_seconds))
                 if said is not None:
-                    first = Ran.of(world, said, ended)
+                    topics = tuple(topic for one in relations.values() for topic in one.topics)
+                    first = Ran.of(world, said, topics, ended)
         outcome = Outcome(
             violations=tuple(one for one in violations if only != -1 or one.index < 0),
             checks=sum(one.checks for one in properties),
@@ -247,7 +248,12 @@ def run(
     if first is None:
         return outcome
     scene = Scene(
-        scenario=scenario, case=trial.case, faults=trial.faults, seed=trial.seed, args=arguments
+        scenario=scenario,
+        case=trial.case,
+        faults=trial.faults,
+        seed=trial.seed,
+        args=arguments,
+        topics=tuple(first.names),
     )
     return _with_images(outcome, relations, first, scene)
 
@@ -269,7 +275,9 @@ def _with_images(
             result = checked(relation, *worlds[without])
         except LockstepError as error:
             complaint = str(error).partition('\n')[0]
-            outcome = replace(outcome, complaints=(*outcome.complaints, complaint))
+            if first.error is None:
+                outcome = replace(outcome, complaints=(*outcome.complaints, complaint))
+            # Else the world has ended before its nodes were there, which is a finding.
             continue
         outcome = replace(
             outcome,

@@ -51,10 +51,13 @@ class Message(NamedTuple):
 
 @dataclass
 class Endpoints:
-    """Full names of the topics of a node that belongs to no test."""
+    """What a node has that belongs to no test."""
 
     published: set[str] = field(default_factory=set)
+    """Full names of topics."""
     subscribed: set[str] = field(default_factory=set)
+    periods: set[int] = field(default_factory=set)
+    """Periods of its timers (ns)."""
 
 
 def endpoints_of(world: Lockstep) -> dict[str, Endpoints]:
@@ -67,6 +70,7 @@ def endpoints_of(world: Lockstep) -> dict[str, Endpoints]:
                 endpoints = found.setdefault(node.get_fully_qualified_name(), Endpoints())
                 endpoints.published.update(one.topic_name for one in node.publishers)
                 endpoints.subscribed.update(one.topic_name for one in node.subscriptions)
+                endpoints.periods.update(one.timer_period_ns for one in node.timers)
 
     world.on_new_topics(look)
     return found
@@ -99,11 +103,12 @@ class Said:
             self._publish = publish
 
             def send(publisher: Publisher, msg: Any) -> None:
-                if self._scheduler.gates.running is not None or self._speaker(publisher) is None:
-                    # It is sent when the callback of a slow node ends, or is none of a node.
+                speaker = self._speaker(publisher)
+                if speaker is None or self._scheduler.gates.running is not None:
+                    # It is none of a node, or is sent when the callback of a slow node ends.
                     publish(publisher, msg)
                 else:
-                    self._on_message(publisher, msg)
+                    self._on_message(speaker, publisher, msg)
 
             return send
 
@@ -114,16 +119,13 @@ class Said:
         """Stop."""
         self._restore()
 
-    def _on_message(self, publisher: Publisher, msg: Any) -> None:
-        self._note(publisher, msg)
+    def _on_message(self, speaker: Speaker, publisher: Publisher, msg: Any) -> None:
+        self._note(speaker, publisher, msg)
         self._publish(publisher, msg)
 
-    def _note(self, publisher: Publisher, msg: Any) -> None:
-        speaker = self._speakers[publisher]
-        if speaker is not None:
-            data = msg if isinstance(msg, bytes) else serialize_message(msg)
-            message = Message(self._scheduler.agenda.now, speaker, publisher.msg_type, data)
-            self.messages.append(message)
+    def _note(self, speaker: Speaker, publisher: Publisher, msg: Any) -> None:
+        data = msg if isinstance(msg, bytes) else serialize_message(msg)
+        self.messages.append(Message(self._scheduler.agenda.now, speaker, publisher.msg_type, data))
 
     def _speaker(self, publisher: Publisher) -> Speaker | None:
         """Return who publishes; None: the world itself, or rclpy."""
@@ -172,7 +174,7 @@ class Border(Said):
     def __enter__(self) -> Border:
         """Put the nodes apart."""
         super().__enter__()
-        self._world.said_apart = self._said
+        self._world.pauses.said = self._said
         agenda = self._scheduler.agenda
         for time in dict.fromkeys(message.time for _, message in self._due):
             agenda.at(time, self._say)
@@ -189,10 +191,9 @@ class Border(Said):
 
         return stage
 
-    def _on_message(self, publisher: Publisher, msg: Any) -> None:
-        self._note(publisher, msg)
-        speaker = self._speakers[publisher]
-        if speaker is not None and speaker.node not in self._apart:
+    def _on_message(self, speaker: Speaker, publisher: Publisher, msg: Any) -> None:
+        self._note(speaker, publisher, msg)
+        if speaker.node not in self._apart:
             self._publish(publisher, msg)
             self._others += 1
         else:

@@ -18,7 +18,7 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._fault_log import Hits, totals
 from diffdrive_jacobian.lockstep._gate import Gate
 from diffdrive_jacobian.lockstep._link import Link, Stage
-from diffdrive_jacobian.messages.names import full_name
+from diffdrive_jacobian.messages.names import full_name, without_namespace
 from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.time_units import in_seconds, nanoseconds
 
@@ -283,8 +283,8 @@ class Injection:
     def _stage(self, filtered: _Filtered, node: Node, message_type: type) -> Stage:
         topic, name = filtered.topic, node.get_fully_qualified_name()
         # The same in each namespace.
-        root = self.world.node.get_namespace().rstrip('/')
-        key = f'{name.removeprefix(root)} {topic.removeprefix(root)}'
+        root = self.world.node.get_namespace()
+        key = f'{without_namespace(name, root)} {without_namespace(topic, root)}'
         change = filtered.begin(self.rng(key), message_type)
         self._filters.append(change)
         observe = getattr(change, 'observe', None)

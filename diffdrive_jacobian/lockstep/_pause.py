@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from bdb import BdbQuit
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from diffdrive_jacobian.time_units import in_seconds
 
@@ -12,19 +12,50 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep.world import Lockstep
 
 
-def pause(world: Lockstep, coming: int) -> None:
-    """Stop in the debugger, before a world time (ns). What is violated there is raised afterwards."""
-    said = world.said_apart
+class Pauses:
+    """When a world stops, and what is known there.
+
+    Attributes:
+        times: World times before which it stops (ns), sorted.
+        what: What this world is.
+        said: The last messages of nodes that are apart, by topic; None: no node is.
+        violated: What a property has raised at the prompt.
+    """
+
+    def __init__(self, world: Lockstep) -> None:
+        """Start without pauses."""
+        self._world = world
+        self.times: list[int] = []
+        self.what = 'the world'
+        self.said: dict[str, Any] | None = None
+        self.violated: Exception | None = None
+
+    def add(self, time: int) -> None:
+        """Add a pause before a world time (ns)."""
+        self.times = sorted([*self.times, time])
+
+    def pause(self, coming: int) -> None:
+        """Stop before a world time (ns) at which a pause is due. Raise afterwards what was violated."""
+        while self.times and self.times[0] <= coming:
+            self.times.pop(0)
+        self.violated = None
+        stop(self._world, coming, self.what, self.said)
+        if self.violated is not None:
+            raise self.violated
+
+
+def stop(world: Lockstep, coming: int, what: str, said: dict[str, Any] | None) -> None:
+    """Stop in the debugger, which shows the variables of this function."""
     lines = [
-        f'{world.paused_as} is paused at {in_seconds(world.world_time)}, before '
-        f'{in_seconds(coming)}: world.step() goes on to there, c to the end',
+        f'{what} is paused at {in_seconds(world.world_time)}, before {in_seconds(coming)}: '
+        'world.step() goes on to there, c to the end',
         *(f'pid {process.pid}: {process.command}' for process in world.processes),
     ]
     if said is not None:
         lines.append(
-            'said has what the nodes under test say here; the others hear what they said at first'
+            'the variable said has the last messages of the nodes under test; the other nodes receive '
+            'those of the first world'
         )
-    world.violated = None
     try:
         breakpoint(header='\n'.join(lines))
     except TypeError:
@@ -32,8 +63,6 @@ def pause(world: Lockstep, coming: int) -> None:
         breakpoint()
     # You are here. The test is further up in the stack.
     world.settle()
-    if world.violated is not None:
-        raise world.violated
 
 
 def ends_all(error: BaseException) -> bool:

@@ -14,6 +14,7 @@ from rclpy.executors import ExternalShutdownException
 from diffdrive_jacobian.lockstep._clock import MAX_SECONDS
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
+from diffdrive_jacobian.lockstep._pause import Pauses
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.numerics.checks import between
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
@@ -62,10 +63,8 @@ class SimulatedTime:
         """The other processes, which are checked when all callbacks of a time have been executed."""
         self.check: Callable[[], None] | None = None
         """Called after that, at each simulated time."""
-        self.pauses: list[int] = []
-        """World times before which to pause (ns), sorted."""
-        self.pause: Callable[[int], None] = lambda _: None
-        """Called there, with the time to which the world goes next (ns)."""
+        self.pauses: Pauses | None = None
+        """Where to stop in a debugger."""
         self.busy = False
         """Whether callbacks are being executed."""
 
@@ -155,8 +154,8 @@ class SimulatedTime:
         agenda = self._agenda
         # The minimum of integers is exact, also beside infinity.
         passed = int(min(self._until_next, end - agenda.now))
-        if self.pauses and agenda.now + passed >= self.pauses[0]:
-            self._pause(agenda.now + passed)
+        if self.pauses is not None and self.pauses.times and agenda.now + passed >= self.pauses.times[0]:
+            self.pauses.pause(agenda.now + passed)
             if agenda.now >= end:
                 return
             # Who looks into the world may have published something, or let time pass.
@@ -166,12 +165,6 @@ class SimulatedTime:
         if not self._clocks.pauses:
             self._clocks.now += passed
         self.arrive()
-
-    def _pause(self, coming: int) -> None:
-        """Pause before a world time (ns)."""
-        while self.pauses and self.pauses[0] <= coming:
-            self.pauses.pop(0)
-        self.pause(coming)
 
     def arrive(self) -> None:
         """Set the clocks of the nodes to the present time, and execute what is due then."""

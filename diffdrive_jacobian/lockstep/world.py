@@ -16,7 +16,6 @@ import threading
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import rclpy
@@ -35,7 +34,7 @@ from diffdrive_jacobian.lockstep._guard import Guard
 from diffdrive_jacobian.lockstep._injection import Fault, absolute_name
 from diffdrive_jacobian.lockstep._messaging import Messaging
 from diffdrive_jacobian.lockstep._nodes import Nodes
-from diffdrive_jacobian.lockstep._pause import pause
+from diffdrive_jacobian.lockstep._pause import Pauses
 from diffdrive_jacobian.lockstep._properties import Properties, Property
 from diffdrive_jacobian.lockstep._report import describe
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
@@ -153,13 +152,8 @@ class Lockstep:
         self._closing.callback(self._close_processes)
         self._time.processes = self._processes
         self._guard = guard
-        self.paused_as = 'the world'
-        """What this world is, where it is paused."""
-        self.said_apart: dict[str, Any] | None = None
-        """What nodes that are apart have said last, by topic; None: none is."""
-        self.violated: PropertyViolation | None = None
-        """What a property has raised last."""
-        self._time.pause = partial(pause, self)
+        self.pauses = self._time.pauses = Pauses(self)
+        """Where it stops in a debugger."""
         self._messaging = Messaging(scheduler, self._nodes, self._time, self.report)
         self._faults = Faults(scheduler, self._nodes, self.settle)
         self._properties = Properties(scheduler, self._nodes, self.report)
@@ -193,7 +187,7 @@ class Lockstep:
         """Destroy the nodes and shut rclpy down. Further calls have no effect."""
         if Lockstep._open is self:
             Lockstep._open = None
-            for time in self._time.pauses:
+            for time in self.pauses.times:
                 warnings.warn(
                     f'pause_at({time / NANOSECONDS:g}): the world has ended at {self.world_seconds:g} s',
                     stacklevel=2,
@@ -392,7 +386,7 @@ class Lockstep:
         """
         self._time.jump(seconds)
 
-    def pause_at(self, seconds: float, what: str = 'the world') -> None:
+    def pause_at(self, seconds: float) -> None:
         """Stop in the debugger before a world time, when all that comes before it has happened.
 
         `breakpoint()` is called. So the prompt of pdb, of pytest or of an IDE has this world as `world`:
@@ -402,7 +396,6 @@ class Lockstep:
 
         Args:
             seconds: World time since the start (s).
-            what: What this world is, for the message.
 
         Raises:
             ValueError: `seconds` is negative, has passed, or is too long.
@@ -413,8 +406,7 @@ class Lockstep:
             raise ValueError(
                 f'seconds must not have passed: {self.world_seconds:g} s have, got {seconds!r}'
             )
-        self._time.pauses = sorted([*self._time.pauses, time])
-        self.paused_as = what
+        self.pauses.add(time)
         self._guard.unlimited = True
         for process in self._processes:
             process.be_patient()
@@ -542,7 +534,7 @@ class Lockstep:
         try:
             self._properties.check()
         except PropertyViolation as violation:
-            self.violated = violation
+            self.pauses.violated = violation
             raise
 
     def finish(self) -> None:

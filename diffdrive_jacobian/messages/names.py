@@ -11,6 +11,12 @@ def full_name(namespace: str, name: str) -> str:
     return f'{namespace.rstrip("/")}/{name}'
 
 
+def without_namespace(name: str, namespace: str) -> str:
+    """Return a full name as seen from a namespace, with a slash; unchanged if it is not in it."""
+    root = namespace.rstrip('/')
+    return name[len(root) :] if name.startswith(f'{root}/') else name
+
+
 def base_name(name: str) -> str:
     """Return a name without its namespace."""
     return name.rpartition('/')[2]

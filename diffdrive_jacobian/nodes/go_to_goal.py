@@ -101,7 +101,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._goal: ActiveGoal | None = None
         self._goals_received = 0
         self._state = State((0, 0), '', (0.0, 0.0, 0.0), STANDSTILL)
-        # Whether the last odometry was ignored because it was older than that before.
+        # Whether the last odometry was ignored because it was older than the previous one.
         self._was_older = False
         self._rate = OdometryRate()
         # Whether the last command makes the robot move: it outlives a goal that is replaced.
@@ -151,8 +151,12 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             )
         if goal is not None and now == 0:
             raise MessageError(NO_CLOCK)
-        stale = goal is not None and goal.stale
-        if state.stamp <= self._state.stamp and self._is_old(state) and not stale:
+        if (
+            state.stamp <= self._state.stamp
+            and goal is not None
+            and goal.executing
+            and self._repeats(state, goal.stale)
+        ):
             return
         self._state, self._was_older = state, False
         if goal is None:
@@ -182,22 +186,22 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             return
         self._publish_command(command, now)
 
-    def _is_old(self, state: State) -> bool:
-        """Return whether odometry that is not newer than the last comes again, or out of order.
+    def _repeats(self, state: State, stale: bool) -> bool:
+        """Return whether odometry is a repetition or out of order, and log and note the latter.
 
-        Not if its stamps do not tell: they are zero, or equal while the robot moves. After two that are
-        older, its source has started again, or the clock was reset.
+        Stamps of zero, and equal stamps with different poses, tell nothing. After two older messages in
+        a row, or when odometry was missing, the source has started again, or the clock was reset.
         """
         if state.stamp == (0, 0):
             return False
         if state.stamp == self._state.stamp:
             return state == self._state
-        before, self._was_older = self._was_older, True
-        if before:
+        if stale or self._was_older:
             return False
+        self._was_older = True
         self.log_event_warning(
             'odometry is old',
-            f'odometry on {self.resolve_topic_name("odom")} is ignored: it is older than the last one',
+            f'odometry on {self.resolve_topic_name("odom")} is ignored: older than the previous one',
         )
         return True
 

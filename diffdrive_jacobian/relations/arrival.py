@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
 from diffdrive_jacobian.faults.fault import Fault, RosName
-from diffdrive_jacobian.lockstep._border import Endpoints, Message
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.numerics.checks import NotNegative, Positive
 from diffdrive_jacobian.relations.base import Relation
 from diffdrive_jacobian.relations.imaging import Imaging
+from diffdrive_jacobian.relations.worlds import Ran
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 
@@ -38,9 +36,14 @@ class _Arrival(Relation):
         """Return the message: what is said stays as it is."""
         return message
 
-    def under_test(self, nodes: Mapping[str, Endpoints], namespace: str) -> set[str]:
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topic."""
+        return (self.topic,)
+
+    def _at_topic(self, first: Ran) -> set[str]:
         """Return the nodes that are subscribed to the topic."""
-        return self._with_topic(nodes, namespace, self.topic, 'subscribed')
+        return first.subscribers(self.topic)
 
     def in_world(self, world: Lockstep) -> Imaging:
         """Return it with the full name that its topic has in a world."""
@@ -51,7 +54,7 @@ class _Arrival(Relation):
 class Repeated(_Arrival):
     """Each message of a topic arrives twice, and nothing changes.
 
-    It is compared in the world without faults. What a node says twice at the same time counts once.
+    It is compared in the world without faults.
 
     Attributes:
         after: Time after which it arrives again (s).
@@ -69,8 +72,8 @@ class Late(_Arrival):
     """The messages of a topic arrive late, by less than their period, and the same is said, later.
 
     What comes after them waits, so the order stays. It is compared in the world without faults. Numbers
-    must lie between those that were said in the first world, from one `period` before to `seconds` and
-    one period after.
+    must lie between those that were said in the first world, from `seconds` and one `period` before to
+    one `period` after. The last such time of a world is not compared.
 
     Attributes:
         seconds: Delay of each message (s).
@@ -87,20 +90,21 @@ class Late(_Arrival):
         """Return the message with its delay."""
         return [(self.seconds if topic == self.topic else 0.0, message)]
 
-    def nearby(self) -> list[Imaging]:
-        """Return none: between limits rounding decides nothing."""
+    def nearby(self, first: Ran) -> list[Imaging]:
+        """Return none: rounding is covered by the limits."""
         return []
 
-    def check(self, messages: Sequence[Message], namespace: str) -> None:
+    def fitted(self, first: Ran) -> Late:
         """Check that messages are late by less than their period."""
-        name = self.topic if self.topic.startswith('/') else full_name(namespace, self.topic)
-        times = [one.time for one in messages if one.speaker.topic == name]
+        name = first.full(self.topic)
+        times = [one.time for one in first.messages if one.speaker.topic == name]
         gaps = sorted(after - before for before, after in pairwise(times) if after > before)
         period = gaps[len(gaps) // 2] / NANOSECONDS if gaps else math.inf
         if self.seconds >= period:
             raise LockstepError(
                 f'{self!r}: seconds must be less than the period of {name}, which is {period:g} s'
             )
+        return self
 
     @property
     def early(self) -> float:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from diffdrive_jacobian.faults.fault import Expression, Fault
-from diffdrive_jacobian.lockstep._border import Endpoints, Message
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.numerics.checks import Positive
 from diffdrive_jacobian.relations.imaging import Imaging
 from diffdrive_jacobian.relations.perturbed import Perturbed
+from diffdrive_jacobian.relations.worlds import Ran
 
 TOLERANCE = 1e-6
-"""Default tolerance of numbers, relative to those above 1."""
+"""Default tolerance of numbers: absolute up to 1, relative above."""
 PAIRS = 2
 """Number of pairs of worlds that show whether rounding decides."""
 
@@ -32,8 +31,8 @@ class Relation(Imaging, Expression, ABC):
     Attributes:
         node: Name of the node under test, resolved as by `Lockstep.find`. Relations that find their
             nodes by a topic need none.
-        tolerance: Largest difference of numbers; above 1 relative to their size. Times may differ by
-            1 us.
+        tolerance: Largest difference of numbers: absolute up to 1, relative above. Times may differ by
+            1 us. What a node says twice at one time counts once.
     """
 
     node: str = field(default='', kw_only=True)
@@ -56,55 +55,48 @@ class Relation(Imaging, Expression, ABC):
         """Return what a node under test must say instead of a message."""
         return self.image(topic, message)
 
-    def nearby(self) -> list[Imaging]:
-        """Return images of the world that differ by little more than rounding, if at all.
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Names of topics that it knows, as a node of the world gives them."""
+        return ()
+
+    def fitted(self, first: Ran) -> Relation:
+        """Return it as it fits to a world.
+
+        Raises:
+            LockstepError: It does not.
+        """
+        return self
+
+    def nearby(self, first: Ran) -> list[Imaging]:
+        """Return images that differ from a world by little more than rounding, if at all.
 
         Where one of them differs from the world, rounding may decide.
         """
-        # In one of a pair each number grows by what it shrinks by in the other.
+        # The two worlds of a pair change each number by opposite amounts.
         return [Perturbed(seed, sign, self.tolerance) for seed in range(PAIRS) for sign in (1, -1)]
-
-    def check(self, messages: Sequence[Message], namespace: str) -> None:
-        """Check that it can be compared with what was said in a world of a namespace.
-
-        Raises:
-            LockstepError: It cannot.
-        """
 
     def is_disturbed_by(self, fault: Fault) -> bool:
         """Return whether it need not hold with a fault. Both worlds are without it then."""
         return False
 
-    def under_test(self, nodes: Mapping[str, Endpoints], namespace: str) -> set[str]:
-        """Return the full names of the nodes under test.
-
-        Args:
-            nodes: All nodes of the world by their full names, without those of the test.
-            namespace: Namespace of the world.
+    def under_test(self, first: Ran) -> set[str]:
+        """Return the full names of the nodes of a world that are under test.
 
         Raises:
             LockstepError: There is none.
         """
-        if not self.node:
-            raise LockstepError(f"{self!r} needs the node under test: {type(self).__name__}(node='...')")
-        name = self.node if self.node.startswith('/') else full_name(namespace, self.node)
-        if name not in nodes:
-            raise LockstepError(f'{self!r}: there is no node {name}; nodes: {_listed(nodes)}')
-        return {name}
-
-    def _with_topic(
-        self, nodes: Mapping[str, Endpoints], namespace: str, topic: str, side: str
-    ) -> set[str]:
-        """Return the nodes that have `published` or `subscribed` to a topic, or that which is named."""
+        there = f'nodes: {", ".join(first.nodes) or "none"}'
         if self.node:
-            return Relation.under_test(self, nodes, namespace)
-        name = topic if topic.startswith('/') else full_name(namespace, topic)
-        found = {one for one, endpoints in nodes.items() if name in getattr(endpoints, side)}
+            name = self.node if self.node.startswith('/') else full_name(first.namespace, self.node)
+            if name not in first.nodes:
+                raise LockstepError(f'{self!r}: there is no node {name}; {there}')
+            return {name}
+        found = self._at_topic(first)
         if not found:
-            verb = 'publishes' if side == 'published' else 'is subscribed to'
-            raise LockstepError(f'{self!r}: no node {verb} {name}; nodes: {_listed(nodes)}')
+            raise LockstepError(f'{self!r}: no node has the topic {first.full(self.topics[0])}; {there}')
         return found
 
-
-def _listed(nodes: Mapping[str, Endpoints]) -> str:
-    return ', '.join(nodes) or 'none'
+    def _at_topic(self, first: Ran) -> set[str]:
+        """Return the nodes under test if none is named."""
+        raise LockstepError(f"{self!r} needs the node under test: {type(self).__name__}(node='...')")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -12,6 +13,7 @@ from diffdrive_jacobian.lockstep._border import Message, Speaker
 from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation, described, raised
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.relations.base import Relation
+from diffdrive_jacobian.relations.between import first_outside
 from diffdrive_jacobian.relations.differences import (
     Difference,
     Spoken,
@@ -45,7 +47,7 @@ class Checked(NamedTuple):
     seconds: float = 0.0
     """Simulated time of the worlds that were run (s)."""
     note: str = ''
-    """What was not compared; empty: everything was."""
+    """Why what came later was not compared; empty: it was."""
     digest: str = ''
     """Hash of all messages of both worlds, if they differ."""
 
@@ -67,12 +69,12 @@ def checked(relation: Relation, first: Ran, scene: Scene) -> Checked:
     Raises:
         LockstepError: There is no node under test, or an image cannot be made.
     """
-    names = relation.under_test(first.nodes, first.namespace)
-    relation.check(first.messages, first.namespace)
+    relation = relation.fitted(first)
+    names = relation.under_test(first)
     image = image_of(relation, first, scene, names)
     result = _compared(relation, first, image, names)
     seconds = image.ran.end / NANOSECONDS
-    if result.difference is None or scene.debugged:
+    if result.difference is None or scene.pause_at is not None:
         return result._replace(seconds=seconds)
     decides, spent = _rounding_decides(relation, first, scene, names, result.difference)
     seconds += spent
@@ -91,13 +93,13 @@ def _rounding_decides(
     """Return whether rounding may be the cause of a difference, and how much was simulated (s).
 
     It may if a world that differs by little more than rounding differs until then, too, or cannot be
-    compared so far. Whole worlds that all differ, do for another reason.
+    compared so far. If whole worlds all differ, rounding is not the cause.
     """
     if found.speaker is not None and not relation.whole_world:
-        # The others keep their order.
+        # So the other nodes do the same as before, in the same order.
         names = {found.speaker.node}
     seconds, same, differ = 0.0, 0, 0
-    for near in relation.nearby():
+    for near in relation.nearby(first):
         image = image_of(near, first, scene, names)
         seconds += image.ran.end / NANOSECONDS
         result = _compared(near, first, image, names)
@@ -131,16 +133,21 @@ def _compared(imaging: Imaging, first: Ran, image: Image, names: Collection[str]
         what = raised(ran.error) if isinstance(ran.error, Exception) else f'it raised {ran.error!r}'
         found.append(Difference(ran.end, what))
     for speaker in dict.fromkeys([*expected, *actual]):
-        difference, until = first_difference(
-            speaker,
-            expected.get(speaker, ()),
-            actual.get(speaker, ()),
-            tolerance=imaging.tolerance,
-            end=end,
-            early=imaging.early,
-            late=imaging.late,
-            period=imaging.longest_move,
-        )
+        both = expected.get(speaker, ()), actual.get(speaker, ())
+        until = None
+        if imaging.late:
+            difference = first_outside(
+                speaker,
+                *both,
+                tolerance=imaging.tolerance,
+                early=nanoseconds(imaging.early),
+                late=nanoseconds(imaging.late),
+                end=end,
+            )
+        else:
+            difference, until = first_difference(
+                speaker, *both, tolerance=imaging.tolerance, period=imaging.longest_move
+            )
         if difference is not None:
             found.append(difference)
         if until is not None and until < end:
@@ -149,7 +156,8 @@ def _compared(imaging: Imaging, first: Ran, image: Image, names: Collection[str]
     count = _count(expected, end - nanoseconds(max(imaging.early, imaging.late)))
     if not image.changed:
         count, note = 0, UNCHANGED
-    topics = {one.speaker.topic for one in first.messages if one.speaker.node in names}
+    compared = [one for one in first.messages if count and one.time < end and one.speaker.node in names]
+    topics = {one.speaker.topic for one in compared}
     return Checked(_first(found, ran), count, frozenset(topics), end, note=note)
 
 
@@ -240,7 +248,7 @@ def check_relation(
         scenario: `scenario(world, case)` creates nodes in a `Lockstep` and advances its time, as of
             `explore`. It must not depend on which of the worlds it is in.
         relation: The relation, such as `Mirrored()`.
-        case: Its second argument.
+        case: Second argument of the scenario.
         faults: Faults of both worlds.
         seed: Seed of their random numbers.
         args: ROS arguments of all nodes, as for `Lockstep`.
@@ -250,6 +258,9 @@ def check_relation(
     Raises:
         PropertyViolation: What they say is not the image of what they said.
         LockstepError: There is no node under test, or it said nothing; or an image cannot be made.
+
+    Warns:
+        UserWarning: Only a part of the world was compared. The message says why.
     """
     given: Any = relation
     if not isinstance(given, Relation):
@@ -261,18 +272,14 @@ def check_relation(
     if not isinstance(faults, (list, tuple)):
         raise LockstepError(f'faults must be a list, got {described(faults)}')
 
-    def paused(world: Lockstep, what: str) -> None:
-        if pause_at is not None:
-            world.pause_at(pause_at, what)
-
     scene = Scene(
         scenario=scenario,
         case=case,
         faults=[one for one in faults if not relation.is_disturbed_by(one)],
         seed=seed,
         args=args,
-        on_world=paused,
-        debugged=pause_at is not None,
+        topics=relation.topics,
+        pause_at=pause_at,
     )
     first = scene.run('the first world', strict=True)
     if first.error is not None:
@@ -286,3 +293,9 @@ def check_relation(
     if not result.compared:
         why = result.note or f'the nodes under test said nothing until {in_seconds(first.end)}'
         raise LockstepError(f'{relation!r}: nothing was compared: {why}')
+    if result.note:
+        until = in_seconds(min(result.end, first.end))
+        warnings.warn(
+            f'{relation!r}: compared until {until} of {in_seconds(first.end)}: {result.note}',
+            stacklevel=2,
+        )

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise, takewhile, zip_longest
-from operator import attrgetter
+from itertools import takewhile, zip_longest
 from typing import Any, NamedTuple
 
 from diffdrive_jacobian.lockstep._border import Speaker
@@ -29,7 +27,6 @@ STAMP_TOLERANCE = 1000
 """Largest difference of times in messages (ns): they may have been floats."""
 SHOWN = 3
 """Number of fields that a difference names."""
-FIRST, IMAGE = 'in the first world', 'in the image'
 QUATERNION = 'geometry_msgs/Quaternion'
 
 
@@ -65,15 +62,15 @@ def differing(one: Any, other: Any, tolerance: float, late: int = 0) -> list[str
     """
     if isinstance(one, bytes) or isinstance(other, bytes) or type(one) is not type(other):
         return [] if one == other else [f'it is {brief(one)}, expected {brief(other)}']
-    fields = zip_longest(_fields(one), _fields(other))
+    fields = zip_longest(fields_of(one), fields_of(other))
     found = []
     for mine, theirs in fields:
         if mine is None or theirs is None or mine[0] != theirs[0]:
             # An array of other length, whose length was noted before.
             break
         path, kind, value = mine
-        if not _close(kind, value, theirs[2], tolerance, late):
-            found.append(f'{_named(path)} {_shown(kind, value)}, expected {_shown(kind, theirs[2])}')
+        if not is_close(kind, value, theirs[2], tolerance, late):
+            found.append(f'{named(path)} {shown(kind, value)}, expected {shown(kind, theirs[2])}')
     return found
 
 
@@ -85,7 +82,8 @@ def exact(message: Any) -> str:
     return ' '.join(repr(plain(value)) for _, kind, value in fields if not is_identifier(kind))
 
 
-def _fields(message: Any) -> Iterator[tuple[str, FieldType, Any]]:
+def fields_of(message: Any) -> Iterator[tuple[str, FieldType, Any]]:
+    """Yield path, type and value of each field. Times, identifiers and quaternions are one value."""
     return walk(structure(type(message)), message, whole=_is_whole)
 
 
@@ -94,7 +92,7 @@ def _is_whole(kind: FieldType) -> bool:
     return is_stamp(kind) or is_identifier(kind) or is_quaternion
 
 
-def _close(kind: FieldType, one: Any, other: Any, tolerance: float, late: int) -> bool:
+def is_close(kind: FieldType, one: Any, other: Any, tolerance: float, late: int) -> bool:
     """Return whether two values of a field are equal but for rounding."""
     if isinstance(kind, Structure):
         if is_identifier(kind):
@@ -103,21 +101,21 @@ def _close(kind: FieldType, one: Any, other: Any, tolerance: float, late: int) -
         if is_stamp(kind):
             return abs(_nanoseconds(one) - _nanoseconds(other)) <= STAMP_TOLERANCE + late
         # A quaternion and its negative are the same rotation.
-        first, second = _quaternion(one), _quaternion(other)
-        return _all_close(first, second, tolerance) or _all_close(
+        first, second = components(one), components(other)
+        return _allis_close(first, second, tolerance) or _allis_close(
             first, [-value for value in second], tolerance
         )
     if isinstance(kind, Number):
-        return _all_close([one], [other], tolerance) if kind.is_float else bool(one == other)
+        return _allis_close([one], [other], tolerance) if kind.is_float else bool(one == other)
     if isinstance(kind, (Array, SequenceType)) and isinstance(kind.element, Number):
         first, second = plain(one), plain(other)
         if isinstance(first, tuple) and kind.element.is_float:
-            return len(first) == len(second) and _all_close(first, second, tolerance)
+            return len(first) == len(second) and _allis_close(first, second, tolerance)
         return bool(first == second)
     return bool(plain(one) == plain(other))
 
 
-def _all_close(first: Iterable[float], second: Iterable[float], tolerance: float) -> bool:
+def _allis_close(first: Iterable[float], second: Iterable[float], tolerance: float) -> bool:
     return all(
         one == other
         or (math.isnan(one) and math.isnan(other))
@@ -130,11 +128,13 @@ def _nanoseconds(stamp: Any) -> int:
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
-def _quaternion(value: Any) -> list[float]:
+def components(value: Any) -> list[float]:
+    """Return the components of a quaternion."""
     return [value.x, value.y, value.z, value.w]
 
 
-def _shown(kind: FieldType, value: Any) -> str:
+def shown(kind: FieldType, value: Any) -> str:
+    """Return the value of a field as text."""
     if isinstance(kind, Structure):
         return brief(value)
     value = plain(value)
@@ -152,9 +152,6 @@ def first_difference(
     image: Sequence[Spoken],
     *,
     tolerance: float,
-    end: int,
-    early: float = 0.0,
-    late: float = 0.0,
     period: float = 0.0,
 ) -> tuple[Difference | None, int | None]:
     """Return the first difference of what a publisher said, and the time from which on it is unknown.
@@ -166,15 +163,9 @@ def first_difference(
         expected: The images of what it has said.
         image: What it said in the image.
         tolerance: Largest difference of numbers.
-        end: Time at which both were last listened to (ns).
-        early: How much earlier the image may say something (s).
-        late: How much later (s).
         period: How far an event may be moved (s), after which nothing is compared.
     """
     expected, image = _once(expected, tolerance), _once(image, tolerance)
-    if early or late:
-        window = round(early * NANOSECONDS), round(late * NANOSECONDS)
-        return _outside(speaker, expected, image, tolerance, *window, end), None
     for index, (old, new) in enumerate(zip_longest(expected, image)):
         if old is not None and new is not None and old.time == new.time:
             differences = differing(new.message, old.message, tolerance)
@@ -223,92 +214,6 @@ def _more(differences: Sequence[str]) -> str:
     return f'; and {more} more fields' if more > 0 else ''
 
 
-def _outside(
-    speaker: Speaker,
-    expected: Sequence[Spoken],
-    image: Sequence[Spoken],
-    tolerance: float,
-    early: int,
-    late: int,
-    end: int,
-) -> Difference | None:
-    """Return the first message that lies outside of those of the other world around its time."""
-    found = []
-    for one in image:
-        if one.time + early >= end:
-            break
-        near = _around(expected, one.time - late, one.time + early)
-        if text := _not_between(one, near, tolerance, early + late, IMAGE, FIRST):
-            found.append(Difference(one.time, text))
-    for one in expected:
-        if one.time + late >= end:
-            break
-        near = _around(image, one.time - early, one.time + late)
-        if text := _not_between(one, near, tolerance, early + late, FIRST, IMAGE):
-            found.append(Difference(one.time, text))
-    if not found:
-        return None
-    first = min(found, key=lambda difference: difference.time)
-    text = f'{speaker.node} on {speaker.topic}: {first.text}'
-    return Difference(first.time, text, speaker)
-
-
-def _around(spoken: Sequence[Spoken], first: int, last: int) -> Sequence[Spoken]:
-    """Return what was said between two times (ns), both included."""
-    begin = bisect_left(spoken, first, key=attrgetter('time'))
-    return spoken[begin : bisect_right(spoken, last, key=attrgetter('time'))]
-
-
-def _not_between(
-    one: Spoken, near: Sequence[Spoken], tolerance: float, late: int, here: str, there: str
-) -> str:
-    """Return why a message is not between others; '': it is. `here` and `there` say where they are."""
-    if not near:
-        return f'{brief(one.message)} {here}, and nothing {there} around this time'
-    if any(not differing(two.message, one.message, tolerance, late) for two in near):
-        return ''
-    others = [{path: value for path, _, value in _fields(two.message)} for two in near]
-    for path, kind, value in _fields(one.message):
-        values = [other[path] for other in others if path in other]
-        if any(_close(kind, value, other, tolerance, late) for other in values):
-            continue
-        numbers, series = _numbers(kind, value), [_numbers(kind, other) for other in values]
-        series = [other for other in series if len(other) == len(numbers)]
-        if not numbers or not series:
-            return f'{_named(path)} {_shown(kind, value)} {here}, another one {there} around this time'
-        if isinstance(kind, Structure):
-            series = [_aligned(other, numbers) for other in series]
-        for index, number in enumerate(numbers):
-            along = [other[index] for other in series]
-            # An event that comes one message earlier cuts off the last step before it.
-            step = max((abs(after - before) for before, after in pairwise(along)), default=0.0)
-            margin = step + tolerance * max(1.0, abs(number))
-            if not min(along) - margin <= number <= max(along) + margin:
-                return (
-                    f'{_named(path)} {number:.9g} {here}, '
-                    f'from {min(along):.9g} to {max(along):.9g} {there} around this time'
-                )
-    return ''
-
-
-def _numbers(kind: FieldType, value: Any) -> Sequence[float]:
-    """Return the numbers of a field that may lie between others. One byte has a meaning, and may not."""
-    match kind:
-        case Structure(name=name) if name == QUATERNION:
-            return _quaternion(value)
-        case Number() if kind.size > 1:
-            return [value]
-        case Array(Number() as element) | SequenceType(Number() as element) if element.size > 1:
-            return tuple(plain(value))
-    return ()
-
-
-def _aligned(quaternion: Sequence[float], other: Sequence[float]) -> Sequence[float]:
-    """Return that of the two quaternions of a rotation which is nearer to another one."""
-    product = sum(one * two for one, two in zip(quaternion, other, strict=True))
-    return quaternion if product >= 0.0 else [-one for one in quaternion]
-
-
-def _named(path: str) -> str:
+def named(path: str) -> str:
     """Return the beginning of what is said of a field, or of a message that is one value."""
     return f'{path} is' if path else 'it is'

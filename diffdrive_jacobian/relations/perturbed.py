@@ -1,7 +1,8 @@
-"""A world in which rounding is a little larger: where it differs, rounding decides what is said."""
+"""A world whose inputs are perturbed at the level of rounding errors."""
 
 from __future__ import annotations
 
+import math
 import random
 from typing import Any
 
@@ -34,6 +35,8 @@ class Perturbed(Imaging):
         return [(0.0, message)]
 
     def _changed(self, value: float, code: str) -> float:
+        if not math.isfinite(value):
+            return value
         least, relative = AMPLITUDES[code]
         change = self._random.uniform(0.5, 1.0) * self._random.choice((-1, 1))
         return value + self._sign * change * max(least, relative * abs(value))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar
 
@@ -10,20 +10,22 @@ from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
 
 from diffdrive_jacobian.faults import Fault
-from diffdrive_jacobian.lockstep._border import Endpoints
+from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.conversion import set_time
+from diffdrive_jacobian.messages.names import namespace_of, without_namespace
 from diffdrive_jacobian.messages.structure import Array, Sequence, Text, parts
 from diffdrive_jacobian.numerics.checks import Positive, between, nonempty
 from diffdrive_jacobian.relations.base import Relation
 from diffdrive_jacobian.relations.imaging import Imaging
+from diffdrive_jacobian.relations.worlds import Ran
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
 GLOBAL = ('/tf', '/tf_static')
 """Topics that all robots share, whose names stay."""
-LITTLE = 1.0, 2.0, 3.0, 5.0, 7.0, 11.0
-"""Times by which worlds are later that show whether rounding decides (s)."""
+LITTLE = 1, 2, 3, 5, 7, 11
+"""Multiples of the periods by which worlds are later that show whether rounding decides."""
 COARSE = 100.0
-"""Their tolerance, relative to that of the relation. Rounding that decides moves more than numbers."""
+"""Their tolerance, relative to that of the relation."""
 LATEST = 1e9
 """Latest start: clocks end 68 years after they begin (s)."""
 TIME = 'builtin_interfaces/Time'
@@ -35,9 +37,9 @@ class WholeWorld(Relation):
 
     whole_world: ClassVar[bool] = True
 
-    def under_test(self, nodes: Mapping[str, Endpoints], namespace: str) -> set[str]:
-        """Return all nodes, or that which is named."""
-        return Relation.under_test(self, nodes, namespace) if self.node else {*nodes}
+    def _at_topic(self, first: Ran) -> set[str]:
+        """Return all nodes."""
+        return {*first.nodes}
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,8 +51,8 @@ class Shifted(WholeWorld):
     cannot jump to a time before 0.
 
     Attributes:
-        seconds: How much later it is (s). A multiple of the periods of all timers, because these tick
-            when the clock shows multiples of their periods.
+        seconds: How much later it is at least (s). The next multiple of the periods of all timers is
+            taken, because these tick when the clock shows multiples of their periods.
         period: The longest period of the timers (s). From the first event on that is moved by up to this
             time, nothing is compared.
     """
@@ -68,10 +70,29 @@ class Shifted(WholeWorld):
         """How much later the clock of the nodes shows at the start (s)."""
         return self.seconds
 
-    def nearby(self) -> list[Imaging]:
-        """Return worlds that are a little later. Their times are rounded otherwise, but as finely."""
+    def fitted(self, first: Ran) -> Shifted:
+        """Return it with the next time that is a multiple of the periods of all timers."""
+        step = first.period()
+        seconds = math.ceil(nanoseconds(self.seconds) / step) * step / NANOSECONDS
+        if seconds > LATEST:
+            raise LockstepError(
+                f'{self!r}: the periods of the timers have no common multiple below '
+                f'{step / NANOSECONDS:g} s; at most {LATEST:g} s is possible'
+            )
+        return replace(self, seconds=seconds)
+
+    def nearby(self, first: Ran) -> list[Imaging]:
+        """Return worlds that are a few periods later. Their times are rounded otherwise, as finely."""
+        step = first.period()
+        # About seconds, so that times are no coarser.
+        step *= math.ceil(NANOSECONDS / step)
+        # What rounding decides moves by more than rounding itself.
         coarse = COARSE * self.tolerance
-        return [replace(self, seconds=seconds, tolerance=coarse) for seconds in LITTLE]
+        return [
+            replace(self, seconds=count * step / NANOSECONDS, tolerance=coarse)
+            for count in LITTLE
+            if count * step <= LATEST * NANOSECONDS
+        ]
 
     def is_disturbed_by(self, fault: Fault) -> bool:
         """Return whether the clock jumps."""
@@ -102,8 +123,9 @@ def _namespace(name: str, value: Any) -> str:
 class Renamed(WholeWorld):
     """In another namespace all nodes do the same.
 
-    Names of topics and nodes must be in it, but for /tf and /tf_static. Names of frames and other texts
-    may begin with it. A node in another process is in a namespace only if its command says so.
+    All nodes run in the namespace. Their topics must be in it, except /tf and /tf_static. Names of
+    frames and other texts may begin with it. A node in another process is in a namespace only if its
+    command says so.
 
     Attributes:
         namespace: The namespace.
@@ -128,13 +150,23 @@ class Renamed(WholeWorld):
         """Return the message."""
         return message
 
-    def nearby(self) -> list[Imaging]:
+    def fitted(self, first: Ran) -> Renamed:
+        """Check that all nodes are in the namespace of the world, which is replaced."""
+        for name in first.nodes:
+            if namespace_of(name) != first.namespace:
+                raise LockstepError(
+                    f'{self!r} replaces the namespace of the world, {first.namespace}; node {name} is '
+                    'in another one'
+                )
+        return self
+
+    def nearby(self, first: Ran) -> list[Imaging]:
         """Return none: nothing is rounded otherwise."""
         return []
 
     def renamed(self, name: str, namespace: str) -> str:
         """Return the full name of a node or a topic in the image."""
-        return name if name in GLOBAL else self.namespace + name.removeprefix(namespace.rstrip('/'))
+        return name if name in GLOBAL else self.namespace + without_namespace(name, namespace)
 
     def compared(self, message: Any, namespace: str) -> Any:
         """Return a message without the namespace in its texts, and without the slash before a name."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.serialization import deserialize_message
 
@@ -20,22 +21,50 @@ Listen = Callable[[Lockstep], AbstractContextManager[Said]]
 """Returns what listens to a world while its scenario runs."""
 
 
-class Ran(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Ran:
     """What the nodes of a world have said."""
 
     messages: Sequence[Message]
     nodes: Mapping[str, Endpoints]
     namespace: str
     """Namespace of the world."""
+    names: Mapping[str, str]
+    """Full names of topics, by those that relations know."""
     end: int
     """World time at the end (ns)."""
     error: BaseException | None = None
     """What has ended the world; None: it came to its end."""
 
     @classmethod
-    def of(cls, world: Lockstep, said: Said, error: BaseException | None = None) -> Ran:
-        """Return what was said in a world until now."""
-        return cls(said.messages, said.nodes, world.node.get_namespace(), world.world_time, error)
+    def of(
+        cls, world: Lockstep, said: Said, topics: Iterable[str], error: BaseException | None = None
+    ) -> Ran:
+        """Return what was said in a world until now, for relations that know topics."""
+        return cls(
+            messages=said.messages,
+            nodes=said.nodes,
+            namespace=world.node.get_namespace(),
+            names={topic: world.node.resolve_topic_name(topic) for topic in topics},
+            end=world.world_time,
+            error=error,
+        )
+
+    def full(self, topic: str) -> str:
+        """Return the full name of a topic that a relation knows."""
+        return self.names[topic]
+
+    def publishers(self, topic: str) -> set[str]:
+        """Return the full names of the nodes that publish a topic that a relation knows."""
+        return {name for name, one in self.nodes.items() if self.names[topic] in one.published}
+
+    def subscribers(self, topic: str) -> set[str]:
+        """Return the full names of the nodes that are subscribed to a topic that a relation knows."""
+        return {name for name, one in self.nodes.items() if self.names[topic] in one.subscribed}
+
+    def period(self) -> int:
+        """Return the least common multiple of the periods of all timers (ns); 1: there are none."""
+        return math.lcm(*(period for one in self.nodes.values() for period in one.periods))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,10 +76,10 @@ class Scene:
     faults: Sequence[Fault] = ()
     seed: int = 0
     args: Sequence[str] = ()
-    on_world: Callable[[Lockstep, str], object] = lambda *_: None
-    """Called with each world, and what it is."""
-    debugged: bool = False
-    """Whether somebody looks into the worlds."""
+    topics: tuple[str, ...] = ()
+    """The topics that relations know."""
+    pause_at: float | None = None
+    """World time before which the world and its image stop in a debugger (s); None: they do not."""
 
     def run(
         self,
@@ -71,7 +100,9 @@ class Scene:
             strict: Whether a fault that meets nothing is an error.
         """
         with Lockstep([*args, *self.args], start=START + later) as world:
-            self.on_world(world, what)
+            if self.pause_at is not None:
+                world.pauses.what = what
+                world.pause_at(self.pause_at)
             world.inject(*self.faults, seed=self.seed)
             with listen(world) as said:
                 try:
@@ -82,8 +113,8 @@ class Scene:
                 except BaseException as error:
                     if ends_all(error):
                         raise
-                    return Ran.of(world, said, error)
-                return Ran.of(world, said)
+                    return Ran.of(world, said, self.topics, error)
+                return Ran.of(world, said, self.topics)
 
 
 def decoded(message: Message) -> Any:

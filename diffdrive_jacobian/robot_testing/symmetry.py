@@ -8,23 +8,24 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from diffdrive_jacobian.faults.fault import RosName
-from diffdrive_jacobian.lockstep._border import Endpoints
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages import structure as types
 from diffdrive_jacobian.messages.structure import Structure, structure
-from diffdrive_jacobian.numerics.checks import Finite
+from diffdrive_jacobian.numerics.checks import Finite, names
 from diffdrive_jacobian.relations.base import Relation
+from diffdrive_jacobian.relations.worlds import Ran
 
 FIXED = ('map', 'odom', 'world', 'earth')
 """Default names of the frames that do not move with a robot, without a prefix."""
 POSES = ('geometry_msgs/Pose', 'geometry_msgs/Transform')
 TWISTS = ('geometry_msgs/Twist', 'geometry_msgs/Accel', 'geometry_msgs/Wrench')
+STAMPED_TWISTS = tuple(f'{name}Stamped' for name in TWISTS)
 POINTS = ('geometry_msgs/Point', 'geometry_msgs/Point32')
 WITHOUT = ('nav_msgs/OccupancyGrid', 'nav_msgs/MapMetaData', 'geometry_msgs/Inertia')
 """Types without an image, beside those of sensor_msgs."""
@@ -42,11 +43,16 @@ class PlaneRelation(Relation):
     """
 
     commands: RosName = field(default='cmd_vel', kw_only=True)
-    fixed: tuple[str, ...] = field(default=FIXED, kw_only=True)
+    fixed: Annotated[tuple[str, ...], names] = field(default=FIXED, kw_only=True)
 
-    def under_test(self, nodes: Mapping[str, Endpoints], namespace: str) -> set[str]:
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topic of the commands."""
+        return (self.commands,)
+
+    def _at_topic(self, first: Ran) -> set[str]:
         """Return the nodes that publish commands."""
-        return self._with_topic(nodes, namespace, self.commands, 'published')
+        return first.publishers(self.commands)
 
     def image(self, topic: str, message: Any) -> Any:
         """Return the image of a message.
@@ -63,12 +69,18 @@ class PlaneRelation(Relation):
         if frame:
             of_robot = not self._is_fixed(frame)
         match kind.name:
+            case name if name in STAMPED_TWISTS and frame and not of_robot:
+                # In a frame that does not move with the robot.
+                self._turn_twist(*_twist_of(message))
             case 'geometry_msgs/TransformStamped':
                 to_robot = not self._is_fixed(message.child_frame_id)
-                self._transform(message.transform, of_robot=of_robot, to_robot=to_robot)
+                if _is_finite(message.transform.translation) and _is_finite(message.transform.rotation):
+                    self._transform(message.transform, of_robot=of_robot, to_robot=to_robot)
             case name if name in POSES:
                 position = message.position if hasattr(message, 'position') else message.translation
-                orientation = getattr(message, 'orientation', None) or message.rotation
+                orientation = (
+                    message.orientation if hasattr(message, 'orientation') else message.rotation
+                )
                 if _is_finite(position) and _is_finite(orientation):
                     self._point(position, of_robot=of_robot)
                     self._rotation(orientation, of_robot=of_robot)
@@ -78,12 +90,10 @@ class PlaneRelation(Relation):
                 self._change(_type(kind, 'pose'), message.pose, topic, of_robot=of_robot)
                 message.covariance = self._covariance(message.covariance, of_robot=of_robot)
             case 'geometry_msgs/TwistWithCovariance' | 'geometry_msgs/AccelWithCovariance':
-                inner = getattr(message, kind.fields[0][0])
-                self._twist(inner.linear, inner.angular)
+                self._twist(*_twist_of(message))
                 message.covariance = self._covariance(message.covariance, of_robot=True)
             case name if name in TWISTS:
-                first, second = (getattr(message, one) for one, _ in kind.fields)
-                self._twist(first, second)
+                self._twist(*_vectors(message))
             case name if name in POINTS:
                 self._point(message, of_robot=of_robot)
             case 'geometry_msgs/Quaternion':
@@ -131,6 +141,10 @@ class PlaneRelation(Relation):
         """Change a twist of the robot in its own frame."""
 
     @abstractmethod
+    def _turn_twist(self, linear: Any, angular: Any) -> None:
+        """Change a twist that is given in a fixed frame."""
+
+    @abstractmethod
     def _covariance(self, covariance: Sequence[float], *, of_robot: bool) -> list[float]:
         """Return the covariance of a pose or of a twist: x, y, z and the rotations about them."""
 
@@ -146,9 +160,9 @@ class Moved(PlaneRelation):
     Positions and headings are turned about the origin by `theta`, then moved by `x` and `y`.
 
     Attributes:
-        x: (m)
-        y: (m)
-        theta: (rad)
+        x: Displacement in x (m).
+        y: Displacement in y (m).
+        theta: Rotation (rad).
     """
 
     x: Finite = 3.0
@@ -184,6 +198,10 @@ class Moved(PlaneRelation):
     def _twist(self, linear: Any, angular: Any) -> None:
         """It stays."""
 
+    def _turn_twist(self, linear: Any, angular: Any) -> None:
+        self._vector(linear, of_robot=False)
+        self._vector(angular, of_robot=False)
+
     def _covariance(self, covariance: Sequence[float], *, of_robot: bool) -> list[float]:
         if of_robot:
             return list(covariance)
@@ -197,6 +215,8 @@ class Moved(PlaneRelation):
                 turned[6 * (up + i) + left + j] = sum(
                     turn[i][k] * covariance[6 * (up + k) + left + m] * turn[j][m]
                     for k, m in product(axes, repeat=2)
+                    # Not 0 times infinity.
+                    if turn[i][k] and turn[j][m]
                 )
         return turned
 
@@ -244,6 +264,9 @@ class Mirrored(PlaneRelation):
     def _twist(self, linear: Any, angular: Any) -> None:
         linear.y, angular.x, angular.z = -linear.y, -angular.x, -angular.z
 
+    def _turn_twist(self, linear: Any, angular: Any) -> None:
+        self._twist(linear, angular)
+
     def _covariance(self, covariance: Sequence[float], *, of_robot: bool) -> list[float]:
         signs = [one * other for one, other in product(self.signs, repeat=2)]
         return [sign * value for sign, value in zip(signs, covariance, strict=True)]
@@ -258,6 +281,19 @@ def _type(kind: Structure, name: str) -> Structure:
     found = dict(kind.fields)[name]
     assert isinstance(found, Structure)
     return found
+
+
+def _vectors(part: Any) -> tuple[Any, Any]:
+    """Return both parts of a twist, of a pose, or of what is like one."""
+    first, second = (getattr(part, name) for name, _ in structure(type(part)).fields)
+    return first, second
+
+
+def _twist_of(message: Any) -> tuple[Any, Any]:
+    """Return both parts of the twist, or what is like one, in a message."""
+    kind = structure(type(message))
+    inner = next(getattr(message, name) for name, one in kind.fields if str(one) in TWISTS)
+    return _vectors(inner)
 
 
 def _is_finite(part: Any) -> bool:

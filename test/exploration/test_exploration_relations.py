@@ -78,7 +78,7 @@ def test_the_written_test_compares_again(tmp_path, pytester):
         ([Repeated], r'relations must be instances of Relation, got .*create one: Repeated'),
         ([DOUBLED, DOUBLED], 'relations: each can be given once'),
         (3, 'relations must be a list, got 3'),
-        ([Repeated('nothing')], 'in a world without faults: .*no node is subscribed to /nothing'),
+        ([Repeated('nothing')], 'in a world without faults: .*no node has the topic /nothing'),
     ],
 )
 def test_relations_are_checked(relations, text):
@@ -91,6 +91,11 @@ def test_a_world_that_fails_is_compared_until_then():
     assert [one.violation.index for one in found.findings] == [-1]
     found = serial(scenarios.divide, relations=[Repeated('speed')], cases=SPEEDS, worlds=4)
     assert {one.violation.index for one in found.findings} <= {-1}
+
+
+def test_a_node_that_fails_at_once_is_a_finding():
+    found = serial(scenarios.refusing, relations=[Repeated('speed')], worlds=1)
+    assert [one.violation.message for one in found.findings] == ['ValueError: not today']
 
 
 def test_what_was_never_compared_is_noted():

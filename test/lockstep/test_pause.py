@@ -53,12 +53,12 @@ def stops(monkeypatch):
 def test_a_world_stops_before_anything_happens_at_a_time(lockstep, stops):
     node = lockstep.create(lambda: Blinker(rate=10.0))
     lockstep.pause_at(0.3)
-    lockstep.pause_at(0.55, 'my world')
+    lockstep.pause_at(0.55)
     stops.act = lambda world: ticks.append(len(node.ticks))
     ticks = []
     lockstep.run_until(lambda: lockstep.world_seconds >= 1.0, 2.0)
     assert [seconds for seconds, _ in stops] == pytest.approx([0.2, 0.5])
-    assert stops[1][1].startswith('my world is paused at 0.5 s, before 0.6 s: world.step() goes on')
+    assert stops[1][1].startswith('the world is paused at 0.5 s, before 0.6 s: world.step() goes on')
     assert ticks == [3, 6]
     assert len(node.ticks) == 11
 
@@ -130,7 +130,7 @@ def test_each_world_of_a_relation_stops(stops):
         world.find('other').create_subscription(type(world.last('blink')), 'blink', lambda _: None, 10)
         world.run_for(0.5)
 
-    with pytest.raises(LockstepError, match='no node is subscribed to /nothing'):
+    with pytest.raises(LockstepError, match='no node has the topic /nothing'):
         check_relation(blinking, Repeated('nothing'), pause_at=0.2)
     check_relation(blinking, Repeated('blink'), pause_at=0.2)
     assert [header.partition(' is')[0] for _, header in stops] == [

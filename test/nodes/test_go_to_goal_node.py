@@ -289,6 +289,10 @@ def test_the_robot_is_stopped_if_its_odometry_only_comes_again(lockstep, control
     for _ in range(8):
         lockstep.run_for(0.1)
         controller.sees(stamped(5.0, 0.1))
-    assert (0.0, 0.0) in twists(controller.commands)
-    controller.sees(stamped(4.0, 0.1))
-    assert 'it is older than the last one' in capfd.readouterr().err
+    assert twists(controller.commands)[-1] == (0.0, 0.0)
+    assert 'odometry is received again' not in capfd.readouterr().err
+    # It goes on when there is other odometry, whatever its stamp.
+    assert controller.sees(stamped(4.0, 0.2)) != [(0.0, 0.0)]
+    assert 'is ignored' not in capfd.readouterr().err
+    controller.sees(stamped(3.0, 0.2))
+    assert 'is ignored: older than the previous one' in capfd.readouterr().err

@@ -17,11 +17,11 @@ END = 1.0
 class Source(Node):
     """Says a number ten times a second, with its time."""
 
-    def __init__(self, values=math.cos):
+    def __init__(self, values=math.cos, period=PERIOD):
         super().__init__('source', start_parameter_services=False)
         self.values, self.count = values, 0
         self.publisher = self.create_publisher(Vector3Stamped, 'number', 10)
-        self.create_timer(PERIOD, self.on_timer)
+        self.create_timer(period, self.on_timer)
 
     def on_timer(self):
         message = Vector3Stamped()

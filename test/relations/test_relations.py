@@ -47,7 +47,7 @@ from diffdrive_jacobian.relations.checking import (
     checked,
 )
 from diffdrive_jacobian.relations.worlds import Scene, decoded
-from diffdrive_jacobian.testing import Lockstep, LockstepError, PropertyViolation
+from diffdrive_jacobian.testing import LockstepError, PropertyViolation
 
 QUIET = ('--ros-args', '--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
 
@@ -67,7 +67,7 @@ NEGATED = Negated(node='answer')
 
 def result(relation, scenario, **arguments):
     """Return how an image compares."""
-    played = Scene(scenario=scenario, case=None, args=QUIET, **arguments)
+    played = Scene(scenario=scenario, case=None, args=QUIET, topics=relation.topics, **arguments)
     return checked(relation, played.run('the first world'), played)
 
 
@@ -308,6 +308,53 @@ def test_a_scenario_that_looks_into_the_node_ends_the_comparison():
     assert (found.difference, found.note, found.end) == (None, UNTIL_OTHERS, 500_000_000)
 
 
+def test_check_relation_warns_of_what_it_did_not_compare():
+    sides = scene(side, lambda count: 1.0 if count < 4 else 0.0)
+    with pytest.warns(UserWarning, match='compared until 0.4 s of 1 s: what came after an event that'):
+        check_relation(sides, NEGATED, args=QUIET)
+
+
+def test_infinite_numbers_stay_where_rounding_is_looked_at():
+    def counting(node, message):
+        return -1.0 if math.isnan(message.vector.x) else len(node.seen)
+
+    found = result(Repeated('number'), scene(counting, lambda _: math.inf))
+    assert found.difference is not None
+
+
+@pytest.mark.parametrize('period', [0.1, 0.3, 0.4, 1 / 30])
+def test_a_shift_is_a_multiple_of_the_periods_of_all_timers(period):
+    """So a defect at later times is found with each of them."""
+
+    def late_only(node, message):
+        return float(len(node.seen) > 3 and from_the_clock(node, message) > 500.0)
+
+    def scenario(world, case):
+        world.create(lambda: Answer(late_only))
+        world.create(lambda: Source(period=period))
+        world.run_for(8 * period)
+
+    found = result(Shifted(), scenario)
+    assert found.difference is not None, found
+    assert found.difference.text.startswith('/answer on /answer: x is 1, expected 0')
+
+
+def test_names_may_be_remapped():
+    args = (*QUIET, '--ros-args', '-r', 'number:=figure')
+    for relation in (Repeated('number'), Late('number')):
+        check_relation(scene(), relation, args=args)
+
+
+def test_nodes_in_namespaces_of_their_own_cannot_be_renamed():
+    def own(world, case):
+        world.create(Source)
+        world.create(lambda: Node('own', namespace='a', start_parameter_services=False))
+        world.run_for(0.2)
+
+    with pytest.raises(LockstepError, match='replaces the namespace of the world, /; node /a/own is in'):
+        check_relation(own, Renamed(), args=QUIET)
+
+
 def test_errors_of_the_first_world_are_raised():
     def failing(world, case):
         scene()(world, case)
@@ -343,8 +390,8 @@ class Heard(Negated):
 @pytest.mark.parametrize(
     ('relation', 'text'),
     [
-        (Repeated('nothing'), 'no node is subscribed to /nothing; nodes: /answer, /echo, /source'),
-        (Moved(), r'Moved\(\): no node publishes /cmd_vel; nodes:'),
+        (Repeated('nothing'), 'no node has the topic /nothing; nodes: /answer, /echo, /source'),
+        (Moved(), r'Moved\(\): no node has the topic /cmd_vel; nodes:'),
         (Repeated('number', node='nobody'), 'there is no node /nobody; nodes: /answer'),
         (Negated(), 'needs the node under test: Negated'),
         (Repeated('number', node='source'), 'no message that the nodes under test hear is changed'),
@@ -421,14 +468,3 @@ def test_relations_are_values():
     for one, expression in VALUES:
         assert repr(one) == expression
         assert eval(expression, vars(relations)) == one == pickle.loads(pickle.dumps(one))
-
-
-def test_worlds_say_what_they_are():
-    said = []
-    played = Scene(
-        scenario=scene(), case=None, args=QUIET, on_world=lambda world, what: said.append(what)
-    )
-    checked(NEGATED, played.run('the first world'), played)
-    assert said == ['the first world', "the image of Negated(node='answer')"]
-    with Lockstep():
-        pass

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from geometry_msgs.msg import (
+    Accel,
     Point,
     PointStamped,
     PolygonStamped,
@@ -20,6 +21,7 @@ from geometry_msgs.msg import (
     Twist,
     TwistStamped,
     Vector3Stamped,
+    WrenchStamped,
 )
 from nav_msgs.msg import Goals, OccupancyGrid, Odometry, Path
 from sensor_msgs.msg import LaserScan
@@ -143,6 +145,32 @@ def test_a_transform_is_moved_by_its_frames(parent, child, expected):
     assert of_transform(moved) == pytest.approx(expected(before))
     mirrored = Mirrored().image('tf', message()).transform
     assert of_transform(mirrored) == pytest.approx(MIRROR @ before @ MIRROR)
+
+
+def test_twists_in_a_fixed_frame_are_turned():
+    def wrench(frame):
+        return filled(WrenchStamped(header=Header(frame_id=frame)))
+
+    def vectors(message):
+        return [[one.x, one.y, one.z] for one in (message.wrench.force, message.wrench.torque)]
+
+    before = np.array(vectors(wrench('map')))
+    assert np.array(vectors(MOTION.image('f', wrench('map')))) == pytest.approx(before @ MOVE[:3, :3].T)
+    assert np.array(vectors(MOTION.image('f', wrench('base_link')))) == pytest.approx(before)
+    assert MOTION.image('f', filled(Accel)) == filled(Accel)
+
+
+def test_an_infinite_covariance_stays_in_its_block():
+    message = Odometry()
+    message.pose.covariance[35] = math.inf
+    moved = MOTION.image('odom', message).pose.covariance
+    assert moved[35] == math.inf
+    assert [value for value in moved if value != 0.0] == [math.inf]
+
+
+def test_fixed_frames_are_names():
+    with pytest.raises(ValueError, match='Moved: fixed must be'):
+        Moved(fixed='map')
 
 
 def test_what_is_seen_from_the_robot_stays():
