@@ -151,12 +151,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             )
         if goal is not None and now == 0:
             raise MessageError(NO_CLOCK)
-        if (
-            state.stamp <= self._state.stamp
-            and goal is not None
-            and goal.executing
-            and self._repeats(state, goal.stale)
-        ):
+        if state.stamp <= self._state.stamp and self._repeats(state):
             return
         self._state, self._was_older = state, False
         if goal is None:
@@ -186,17 +181,19 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             return
         self._publish_command(command, now)
 
-    def _repeats(self, state: State, stale: bool) -> bool:
+    def _repeats(self, state: State) -> bool:
         """Return whether odometry is a repetition or out of order, and log and note the latter.
 
-        Stamps of zero, and equal stamps with different poses, tell nothing. After two older messages in
-        a row, or when odometry was missing, the source has started again, or the clock was reset.
+        Stamps of zero, and equal stamps with different poses, tell nothing. A repetition may begin a
+        goal. After two older messages in a row, or when odometry was missing, the source has started
+        again, or the clock was reset.
         """
+        goal = self._goal
         if state.stamp == (0, 0):
             return False
         if state.stamp == self._state.stamp:
-            return state == self._state
-        if stale or self._was_older:
+            return goal is not None and goal.executing and state == self._state
+        if self._was_older or (goal is not None and goal.stale):
             return False
         self._was_older = True
         self.log_event_warning(
