@@ -201,7 +201,7 @@ class Border(Said):
         self._say()
 
     def _say(self) -> None:
-        """Let the others hear what is due now, if the publishers are there."""
+        """Send to the others what is due now, if the publishers are there."""
         due, now = self._due, self._scheduler.agenda.now
         while due and due[0][0] <= self._others and due[0][1].time <= now:
             message = due[0][1]

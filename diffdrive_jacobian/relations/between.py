@@ -49,18 +49,16 @@ def first_outside(
         end: Time until which both were listened to (ns).
     """
     found = []
-    for one in image:
-        if one.time + early >= end:
-            break
-        near = _around(expected, one.time - late, one.time + early)
-        if text := _not_between(one, near, tolerance, early + late, IMAGE, FIRST):
-            found.append(Difference(one.time, text))
-    for one in expected:
-        if one.time + late >= end:
-            break
-        near = _around(image, one.time - early, one.time + late)
-        if text := _not_between(one, near, tolerance, early + late, FIRST, IMAGE):
-            found.append(Difference(one.time, text))
+    for here, there, before, after, names in (
+        (image, expected, late, early, (IMAGE, FIRST)),
+        (expected, image, early, late, (FIRST, IMAGE)),
+    ):
+        for one in here:
+            if one.time + after >= end:
+                break
+            near = _around(there, one.time - before, one.time + after)
+            if text := _not_between(one, near, tolerance, early + late, *names):
+                found.append(Difference(one.time, text))
     if not found:
         return None
     first = min(found, key=lambda difference: difference.time)

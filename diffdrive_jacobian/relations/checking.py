@@ -74,10 +74,12 @@ def checked(relation: Relation, first: Ran, scene: Scene) -> Checked:
     image = image_of(relation, first, scene, names)
     result = _compared(relation, first, image, names)
     seconds = image.ran.end / NANOSECONDS
-    if result.difference is None or scene.pause_at is not None:
+    if result.difference is None:
         return result._replace(seconds=seconds)
-    decides, spent = _rounding_decides(relation, first, scene, names, result.difference)
-    seconds += spent
+    decides = False
+    if scene.pause_at is None:
+        decides, spent = _rounding_decides(relation, first, scene, names, result.difference)
+        seconds += spent
     if decides:
         end = result.difference.time
         count = sum(one.time < end for one in first.messages if one.speaker.node in names)

@@ -423,6 +423,17 @@ def test_arguments_and_faults_are_checked():
         Shifted(1e12)
 
 
+def test_a_violation_has_the_same_hash_where_somebody_looks_into_it(monkeypatch):
+    """So a written test says whether it is as found, with a pause, too."""
+    monkeypatch.setattr('sys.breakpointhook', lambda **_: None)
+    digests = []
+    for pause_at in (None, 0.2):
+        with pytest.raises(PropertyViolation) as raised:
+            check_relation(scene(total), Repeated('number'), args=QUIET, pause_at=pause_at)
+        digests.append(raised.value.digest)
+    assert digests[0] == digests[1] != ''
+
+
 def test_who_quits_the_debugger_ends_all():
     def quitting(world, case):
         quits.append(world)
