@@ -24,7 +24,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from diffdrive_jacobian.control import Path
-from diffdrive_jacobian.errors import DiffdriveError, UserError
+from diffdrive_jacobian.errors import NotDoneError, UserError
 from diffdrive_jacobian.messages.codecs import JOINT_STATE, Wheels
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.topics import Selection
@@ -66,7 +66,7 @@ STOP_PATIENCE = 2.0
 """Longest time in which the robot may come to rest at the end, and report that (s)."""
 
 
-class DriveError(DiffdriveError):
+class DriveError(NotDoneError):
     """A drive in simulated time was aborted. The message says why."""
 
 

@@ -1,8 +1,8 @@
-"""The base class of the errors of this package, and the error of those who start its programs."""
+"""The base class of the errors of this package, and what its programs end with."""
 
 from __future__ import annotations
 
-__all__ = ['DiffdriveError', 'UserError']
+__all__ = ['DiffdriveError', 'InterruptionError', 'NotDoneError', 'UserError']
 
 
 class DiffdriveError(Exception):
@@ -15,3 +15,11 @@ class DiffdriveError(Exception):
 
 class UserError(DiffdriveError):
     """An argument, a parameter or the environment of a program is invalid; the message names it."""
+
+
+class NotDoneError(DiffdriveError):
+    """What was asked for in the right way was not done: a file cannot be written, for example."""
+
+
+class InterruptionError(DiffdriveError):
+    """The caller or a signal ended something before it was done. The message says what is left."""

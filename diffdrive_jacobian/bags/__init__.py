@@ -10,13 +10,11 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.bags.bag_reader import (
         BagError,
         DamagedBagError,
-        ReadingInterruptedError,
     )
     from diffdrive_jacobian.bags.files import NotABagError
     from diffdrive_jacobian.bags.recovery import (
         NothingToSaveError,
         Recovery,
-        RecoveryInterruptedError,
         UncheckedError,
         recover,
     )
@@ -28,9 +26,7 @@ __all__ = [
     'DamagedBagError',
     'NotABagError',
     'NothingToSaveError',
-    'ReadingInterruptedError',
     'Recovery',
-    'RecoveryInterruptedError',
     'Run',
     'Series',
     'UncheckedError',
@@ -48,9 +44,7 @@ if not TYPE_CHECKING:
             'DamagedBagError': 'bags.bag_reader',
             'NotABagError': 'bags.files',
             'NothingToSaveError': 'bags.recovery',
-            'ReadingInterruptedError': 'bags.bag_reader',
             'Recovery': 'bags.recovery',
-            'RecoveryInterruptedError': 'bags.recovery',
             'Run': 'bags.run',
             'Series': 'bags.run',
             'UncheckedError': 'bags.recovery',

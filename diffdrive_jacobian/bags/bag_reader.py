@@ -29,10 +29,6 @@ class BagError(DiffdriveError):
         super().__init__(printable(message, PATH_LIMIT))
 
 
-class ReadingInterruptedError(DiffdriveError):
-    """The user does not want the result any more."""
-
-
 class MetadataError(DiffdriveError, ValueError):
     """A value in a bag is invalid; the message says which, what it is, and what is allowed."""
 

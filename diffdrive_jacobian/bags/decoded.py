@@ -14,12 +14,13 @@ from typing import Any
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
-from diffdrive_jacobian.bags.bag_reader import ReadingInterruptedError, messages, stored_connections
+from diffdrive_jacobian.bags.bag_reader import messages, stored_connections
 from diffdrive_jacobian.bags.message_definitions import (
     known_structure,
     recorded_definition_differs,
     type_hashes,
 )
+from diffdrive_jacobian.errors import InterruptionError
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import Codec
 from diffdrive_jacobian.messages.conversion import MessageError
@@ -73,7 +74,7 @@ def read_messages(
         interrupted: Is called for each message; once it returns True, reading ends.
 
     Raises:
-        ReadingInterruptedError: `interrupted` returned True.
+        InterruptionError: `interrupted` returned True.
         BagError: The bag is damaged.
     """
     tally, unreadable = Tally(), Counter[str]()
@@ -89,7 +90,7 @@ def read_messages(
         tally.expected[connection.topic] += connection.msgcount
     for connection, received, data in messages(reader, connections, unreadable):
         if interrupted():
-            raise ReadingInterruptedError
+            raise InterruptionError
         tally.read[connection.topic] += 1
         reasons = tally.reasons[connection.topic]
         if connection.id in foreign:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
+from diffdrive_jacobian.bags.bag_reader import BagError
 from diffdrive_jacobian.bags.recorded_robot import (
     MARGIN,
     ROBOT,
@@ -26,6 +26,7 @@ from diffdrive_jacobian.bags.recorded_robot import (
     start_covariances,
 )
 from diffdrive_jacobian.bags.run import Run, Series
+from diffdrive_jacobian.errors import InterruptionError
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
 from diffdrive_jacobian.messages.names import base_name
 from diffdrive_jacobian.numerics.elementary import wrap
@@ -78,7 +79,7 @@ def robots_at_odometry(
     """Yield, for each odometry message since the start, its index, its epoch, and the robot then.
 
     Raises:
-        ReadingInterruptedError: `interrupted` returned True.
+        InterruptionError: `interrupted` returned True.
         BagError: The odometry has other epochs, or none of its messages is later than a command.
     """
     stamps, epochs = run.odometry.stamps, driven.epochs
@@ -96,7 +97,7 @@ def robots_at_odometry(
     followed = False
     for index, epoch in enumerate(of_message):
         if interrupted():
-            raise ReadingInterruptedError
+            raise InterruptionError
         robot = _nearest(epochs[epoch], run.odometry, index)
         if robot is not None:
             followed |= int(stamps[index]) > first_commands[epoch]

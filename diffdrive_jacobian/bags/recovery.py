@@ -31,7 +31,7 @@ from diffdrive_jacobian.bags.message_definitions import (
     known_definition,
     known_structure,
 )
-from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.errors import InterruptionError, NotDoneError
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 from diffdrive_jacobian.text import printable
 
@@ -52,16 +52,12 @@ def _decoder(channel: Channel) -> Decoder | None:
     return None
 
 
-class NothingToSaveError(DiffdriveError):
+class NothingToSaveError(NotDoneError):
     """There is nothing to recover; the arguments are the reason and what could not be read."""
 
 
 class UncheckedError(NothingToSaveError):
     """Nothing is missing as far as could be checked; the arguments are that, and what could not be."""
-
-
-class RecoveryInterruptedError(DiffdriveError):
-    """The recovery was interrupted; no bag was written."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -107,7 +103,7 @@ def recover(
         NothingToSaveError: The bag is complete, or not a message can be read.
         FileExistsError: The new bag exists, and is not to be replaced or is the old one.
         OSError: The old bag cannot be read, or the new one not be written.
-        RecoveryInterruptedError: `interrupted` returned True.
+        InterruptionError: `interrupted` returned True.
     """
     if not what.exists() and journal_of(what).is_file():
         what = journal_of(what)
@@ -124,7 +120,7 @@ def recover(
         def records() -> Iterator[Record]:
             for record in old.records():
                 if interrupted():
-                    raise RecoveryInterruptedError
+                    raise InterruptionError('no bag was written')
                 yield record
 
         survey = _Survey(records())

@@ -210,7 +210,7 @@ def read_run(
         interrupted: Is called for each message; once it returns True, reading ends.
 
     Raises:
-        ReadingInterruptedError: `interrupted` returned True.
+        InterruptionError: `interrupted` returned True.
         BagError: It is not a bag, is damaged, has several topics of the same name, or none in the
             namespace.
     """

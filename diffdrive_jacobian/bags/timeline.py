@@ -5,7 +5,7 @@ Times are seconds since the first odometry, by its own stamps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import attrgetter
@@ -44,6 +44,12 @@ class Timeline:
     """Where the odometry is reset: no path leads there from the message before."""
     goal: Indices
     """Which of `run.goals` is driven to; -1: none."""
+    start: float
+    """When the first goal or path was sent (s); NaN: none was, or it was refused."""
+    outcome: GoalState
+    """What became of the last goal or path; UNKNOWN: there was none, or nothing is known of it."""
+    end: float
+    """When the last goal or path ended (s); NaN: it did not."""
     distance: Array
     """To that goal, of the point that the controller drives (m); NaN: none."""
     bearing_error: Array
@@ -65,6 +71,12 @@ class Timeline:
     """Distance from the path, positive to its left (m); NaN: none."""
     path_heading_error: Array
     """From the direction of the path to the heading (rad); NaN: none."""
+
+    def travelled(self) -> Array:
+        """Return the length of the path up to each odometry message, shape (n,) (m)."""
+        steps = np.hypot(*np.diff(self.run.odometry.values[:, :2], axis=0).T)
+        steps[self.breaks - 1] = 0.0
+        return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def timeline(run: Run) -> Timeline:
@@ -99,11 +111,16 @@ def timeline(run: Run) -> Timeline:
     last = [sent.rows[-1] for sent, _ in routes if sent.rows and not sent.is_path]
     paths, path, errors = _along_paths(run, routes, driven)
     counts = _over_time(run, lambda now: heading_counts(now.of_node('go_to_goal')))
+    outcome, ended = _outcome(routes, odometry.received[reached])
+    sent = [sent.received for sent, _ in routes if sent.rows]
     return Timeline(
         run=run,
         time=seconds(run, odometry),
         breaks=breaks,
         goal=goal,
+        start=float(on_axis(run, sent[:1])[0]) if sent else np.nan,
+        outcome=outcome,
+        end=float(on_axis(run, [ended])[0]) if ended else np.nan,
         distance=np.hypot(*to_goal.T),
         bearing_error=np.where(reached, np.nan, wrap(np.arctan2(dy, dx) - theta)),
         goal_heading_error=np.where(
@@ -135,6 +152,12 @@ def seconds(run: Run, series: Series) -> Array:
     return np.asarray((stamps - odometry.stamps[0]) / NANOSECONDS, dtype=np.float64)
 
 
+def on_axis(run: Run, recorded: Sequence[int]) -> Array:
+    """Place times of the recorder's clock (ns) on the time axis, shape (n,) (s)."""
+    received = np.array(recorded, dtype=np.int64)
+    return seconds(run, Series(received=received, stamps=received, values=np.empty((len(received), 0))))
+
+
 def jumps(series: Series) -> Indices:
     """Return before which messages of odometry time goes back, or the robot is elsewhere at once."""
     stamps, values = series.stamps, series.values
@@ -145,6 +168,21 @@ def jumps(series: Series) -> Indices:
     fastest = np.maximum(np.fmax(speed[:-1], speed[1:]), usual)
     reset = (dt < 0.0) | (step > np.fmax(TELEPORT, 3.0 * fastest * dt))
     return np.flatnonzero(reset) + 1
+
+
+def _outcome(routes: list[Followed], reached: Times) -> tuple[GoalState, int]:
+    """Return what became of the last goals or path, and when they ended (ns); 0: they did not.
+
+    `reached` is when each odometry was recorded at which the last of some goals was reached.
+    """
+    for sent, followed in routes[:-2:-1]:
+        if followed.state.ended:
+            return followed.state, int(followed.since)
+        arrived = reached[reached >= sent.received]
+        if followed.state is GoalState.UNKNOWN and len(arrived):
+            return GoalState.SUCCEEDED, int(arrived[0])
+        return followed.state, 0
+    return GoalState.UNKNOWN, 0
 
 
 def _breaks(run: Run) -> Indices:

@@ -120,7 +120,7 @@ def verify(
         interrupted: Is called for each odometry message; once it returns True, the simulation ends.
 
     Raises:
-        ReadingInterruptedError: `interrupted` returned True.
+        InterruptionError: `interrupted` returned True.
         BagError: There is no odometry, there are no commands, no odometry is later than a command, the
             state of a robot that takes time is never known, or the times of the commands and of the
             odometry are of different clocks.

@@ -365,7 +365,7 @@ def read_wheels_and_reference(
         interrupted: Is called for each message; once it returns True, reading ends.
 
     Raises:
-        ReadingInterruptedError: `interrupted` returned True.
+        InterruptionError: `interrupted` returned True.
         BagError: It is not a bag, is damaged, or has not what is needed.
     """
     path = Path(path)

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.calibration.motion import Geometry
-from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.errors import NotDoneError
 
 Array = NDArray[np.float64]
 
 
-class CalibrationError(DiffdriveError):
+class CalibrationError(NotDoneError):
     """The recordings contradict the model or each other; the message says why."""
 
 

@@ -1,7 +1,7 @@
 """Pictures of the five documents, each drawn by one function; figures of runs and sweeps.
 
-`geometry()` returns a matplotlib figure, which `plot_jacobian geometry` writes to a file. `run_figure`
-draws runs, `sweep_figure` draws sweeps. Neither ROS nor a display is needed. matplotlib is imported when
+Each function returns a matplotlib figure: `geometry()` the picture that `plot_jacobian geometry` writes,
+`run_figure(runs)` that of `plot_run`. Neither ROS nor a display is needed. matplotlib is imported when
 something is drawn: without it that raises ModuleNotFoundError.
 """
 
@@ -13,6 +13,7 @@ from diffdrive_jacobian import lazy
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.plots.arm_pictures import arm_ellipses, damping, legs, null_space, spring
+    from diffdrive_jacobian.plots.calibration_pictures import calibration_figure
     from diffdrive_jacobian.plots.motion_pictures import lie_bracket, parking, path_laws
     from diffdrive_jacobian.plots.robot_pictures import (
         figure_1,
@@ -23,12 +24,15 @@ if TYPE_CHECKING:
         velocity_ellipses,
         wheel,
     )
+    from diffdrive_jacobian.plots.run_pictures import run_figure
     from diffdrive_jacobian.plots.spatial_pictures import arm_at, elbow
+    from diffdrive_jacobian.plots.sweep_pictures import sweep_figure
 
 __all__ = [
     'PICTURES',
     'arm_at',
     'arm_ellipses',
+    'calibration_figure',
     'damping',
     'elbow',
     'figure_1',
@@ -80,5 +84,5 @@ PICTURES = {name: what for name, (_, what) in _PICTURES.items()}
 """What each picture shows."""
 if not TYPE_CHECKING:
     _FUNCTIONS = {name: f'plots.{module}' for name, (module, _) in _PICTURES.items()}
-    _MODULES = {name: f'plots.{name}' for name in ('run_figure', 'sweep_figure')}
-    __getattr__, __dir__ = lazy.attach(__name__, _FUNCTIONS | _MODULES)
+    _FIGURES = {f'{what}_figure': f'plots.{what}_pictures' for what in ('calibration', 'run', 'sweep')}
+    __getattr__, __dir__ = lazy.attach(__name__, _FUNCTIONS | _FIGURES)

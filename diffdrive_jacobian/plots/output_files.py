@@ -12,6 +12,8 @@ from datetime import datetime
 from itertools import count
 from pathlib import Path
 
+from diffdrive_jacobian.errors import NotDoneError, UserError
+
 FORMATS = ('png', 'svg', 'pdf')
 """File name extensions of figures."""
 NOT_OVERWRITTEN = 'it is not overwritten (--force overwrites files)'
@@ -83,13 +85,12 @@ def new_file(name: str, formats: Sequence[str], what: str, *, replace: bool = Fa
     `formats` are the allowed file name extensions, `what` is the content for the error message.
 
     Raises:
-        ValueError: The file name has another extension.
-        FileExistsError: The file exists.
-        OSError: It cannot be written. `filename` is the path.
+        UserError: The file name has another extension, or the file exists.
+        NotDoneError: It cannot be written.
     """
     path = Path(name)
     if extension(path) not in formats:
-        raise ValueError(f'the {what} must end in .{", .".join(formats)}, got {name!r}')
+        raise UserError(f'the {what} must end in .{", .".join(formats)}, got {name!r}')
     try:
         try:
             # Also of a link to nothing. `lexists` hides other errors: a name that is too long.
@@ -99,11 +100,15 @@ def new_file(name: str, formats: Sequence[str], what: str, *, replace: bool = Fa
             exists = False
             check_directory(path.parent)
     except OSError as error:
-        error.filename = str(path)
-        raise
+        raise cannot_write(path, error) from error
     if exists and not (replace and path.is_file()):
-        raise FileExistsError(f'{path} exists already; {NOT_OVERWRITTEN}')
+        raise UserError(f'{path} exists already; {NOT_OVERWRITTEN}')
     return path
+
+
+def cannot_write(path: object, error: OSError, result: str = '') -> NotDoneError:
+    """Return the error for a path that cannot be written, and what was written instead."""
+    return NotDoneError(f'{path} cannot be written: {error.strerror or error}{result}')
 
 
 def check_directory(path: Path) -> None:

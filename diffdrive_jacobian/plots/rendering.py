@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Callable
 from functools import wraps
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
+
+from diffdrive_jacobian.plots.output_files import create, extension
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,8 +46,9 @@ def styled() -> Any:
     """Return a context manager that sets this style, independent of the user's configuration."""
     import matplotlib
 
-    # The backend is not needed, and would not be restored.
-    style: Any = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != 'backend'}
+    # The backend is not needed, and would not be restored. With the salt equal figures are equal files.
+    kept = ('backend', 'svg.hashsalt')
+    style: Any = {name: value for name, value in matplotlib.rcParamsDefault.items() if name not in kept}
     return matplotlib.rc_context({**style, **_STYLE})
 
 
@@ -72,6 +77,13 @@ def render(drawing: Figure, ending: str) -> bytes:
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
     """
+    with styled(), warnings.catch_warnings():
+        # The font may lack a letter of a bag's name.
+        warnings.filterwarnings('ignore', message='Glyph')
+        return _render(drawing, ending)
+
+
+def _render(drawing: Figure, ending: str) -> bytes:
     content = io.BytesIO()
     module, name = _CANVASES[ending]
     canvas = getattr(import_module(f'matplotlib.backends.{module}'), name)(drawing)
@@ -82,6 +94,16 @@ def render(drawing: Figure, ending: str) -> bytes:
         _lay_out(drawing, POINTS)
         getattr(canvas, f'print_{ending}')(content)
     return content.getvalue()
+
+
+def write(drawing: Figure, path: Path, *, replace: bool = False) -> None:
+    """Write a figure to a new file, which appears only when it is complete.
+
+    Raises:
+        FileExistsError: It exists, and is not to be replaced.
+        OSError: It cannot be written.
+    """
+    create(path, render(drawing, extension(path)), replace=replace)
 
 
 def _lay_out(drawing: Figure, dpi: int) -> None:

@@ -141,10 +141,11 @@ def robot(axes: Axes, pose: ArrayLike, r: float, L: float) -> None:
     wheels(axes, pose, r, L)
 
 
-def wheels(axes: Axes, pose: ArrayLike, r: float, L: float) -> None:
+def wheels(axes: Axes, pose: ArrayLike, r: float, L: float, zorder: float = 3.0, **style: Any) -> None:
     """Draw the wheels of a robot from above with their axle."""
-    line(axes, *placed([[0.0, -L / 2.0], [0.0, L / 2.0]], pose), lw=2.0, color=GREY)
+    axle = placed([[0.0, -L / 2.0], [0.0, L / 2.0]], pose)
+    line(axes, *axle, lw=2.0, color=GREY, zorder=zorder - 1.0, **style)
     half = TYRE * L / 2.0
     for side in (-L / 2.0, L / 2.0):
         wheel = [[-r, side - half], [r, side - half], [r, side + half], [-r, side + half]]
-        outline(axes, placed(wheel, pose), fc='#bbbbbb', zorder=3)
+        outline(axes, placed(wheel, pose), fc='#bbbbbb', zorder=zorder, **style)

@@ -7,10 +7,12 @@ give the noise of the wheels. The ellipse of the published second moment is for 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.bags.timeline import Array, Indices, Timeline
 from diffdrive_jacobian.messages.topics import OF_POSE
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
@@ -35,9 +37,10 @@ GRID = 121
 """Number of points along each side of the grid on which the outline of a region is found."""
 SMALLEST = 1e-4
 """Size below which a region is not drawn (m)."""
-FILL, OUTLINE, ELLIPSE = '#9ecae1', '#3182bd', '#7f7f7f'
-REGION_LABEL = '95 % region: exponential coordinates of SE(2), all orders'
-ELLIPSE_LABEL = '95 % ellipse of the covariance'
+FILL, OUTLINE, ELLIPSE = '#c9b8ef', '#7a4fd0', '#7f7f7f'
+REGION_LABEL = 'the robot is truly in here with 95 %'
+SLIPPING = f'{REGION_LABEL}, if\nits wheels slip by wheel_travel_variance'
+ELLIPSE_LABEL = 'the same by the covariance of odom alone'
 
 
 class Uncertainty(NamedTuple):
@@ -61,7 +64,7 @@ def uncertainties(one: Timeline, places: int = PLACES) -> list[Uncertainty]:
         return []
     begins = [0, *one.breaks.tolist()]
     found = []
-    travelled = distance_travelled(one)
+    travelled = one.travelled()
     wanted = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], places + 1)[1:])
     wanted = np.unique([*wanted.tolist(), len(poses) - 1])
     for begin, end in zip(begins, [*begins[1:], len(poses)], strict=True):
@@ -71,24 +74,12 @@ def uncertainties(one: Timeline, places: int = PLACES) -> list[Uncertainty]:
     return found
 
 
-def distance_travelled(one: Timeline) -> Array:
-    """Return the length of the path up to each odometry message, shape (n,) (m)."""
-    steps = np.hypot(*np.diff(one.run.odometry.values[:, :2], axis=0).T)
-    steps[one.breaks - 1] = 0.0
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def draw_uncertainty(plane: Axes, one: Timeline) -> bool:
-    """Draw the regions along a path, and the ellipses. Return whether there are any."""
-    drawn = False
-    # Otherwise the grids of the regions remove the margins of the axes.
-    plane.use_sticky_edges = False
-    for uncertainty in uncertainties(one):
+def draw_uncertainty(plane: Axes, found: Sequence[Uncertainty]) -> None:
+    """Draw regions along a path, and the ellipses."""
+    for uncertainty in found:
         (left, low), (right, high) = uncertainty.extent
         size = max(right - left, high - low)
-        if size < SMALLEST:
-            continue
-        drawn, margin = True, 0.15 * size
+        margin = 0.15 * size
         x, y = np.meshgrid(
             np.linspace(left - margin, right + margin, GRID),
             np.linspace(low - margin, high + margin, GRID),
@@ -99,16 +90,16 @@ def draw_uncertainty(plane: Axes, one: Timeline) -> bool:
         plane.contourf(x, y, root, [0.0, edge], colors=[FILL], alpha=0.5, zorder=1.2)
         plane.contour(x, y, root, [edge], colors=[OUTLINE], linewidths=0.9, zorder=1.3)
         plane.plot(*_ellipse(uncertainty).T, color=ELLIPSE, lw=0.9, ls='--', zorder=1.4)
-    return drawn
 
 
-def uncertainty_marks() -> list[Patch | Line2D]:
+def uncertainty_marks(run: Run) -> list[Patch | Line2D]:
     """Return the legend of the regions and the ellipses."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
+    ours = 'wheel_travel_variance' in run.of_node('virtual_robot')
     return [
-        Patch(fc=FILL, ec=OUTLINE, alpha=0.7, label=REGION_LABEL),
+        Patch(fc=FILL, ec=OUTLINE, alpha=0.7, label=SLIPPING if ours else REGION_LABEL),
         Line2D([], [], color=ELLIPSE, lw=0.9, ls='--', label=ELLIPSE_LABEL),
     ]
 
@@ -156,6 +147,8 @@ def _along(poses: Array, covariances: Array, knots: Indices, wanted: Indices) ->
         if index in places:
             points = poses[index, :2] + runs[:, :2]
             extent = np.stack([points.min(axis=0), points.max(axis=0)])
+            if np.ptp(extent, axis=0).max() < SMALLEST:
+                continue
             moment = _matrix(covariances[index])[:2, :2]
             found.append(Uncertainty(region_of(poses[index], runs), extent, moment))
     return found

@@ -27,7 +27,7 @@ from diffdrive_jacobian.bags.journal import (
     Text,
 )
 from diffdrive_jacobian.bags.salvage import Topic, read_mcap
-from diffdrive_jacobian.errors import DiffdriveError, UserError
+from diffdrive_jacobian.errors import NotDoneError, UserError
 from diffdrive_jacobian.plots.output_files import names_by_time
 from diffdrive_jacobian.text import printable
 
@@ -134,7 +134,7 @@ class JournalThread:
                 return
 
 
-class RecordingError(DiffdriveError):
+class RecordingError(NotDoneError):
     """A recording is not complete. The message says why, and where the recorded messages are."""
 
     def __init__(self, message: str, summary: Summary | None = None) -> None:
@@ -349,7 +349,7 @@ def open_recording(
     """Start a recording to a path of the user, or in the current directory as `PREFIX_DATE-TIME`.
 
     Raises:
-        OSError: The bag exists or cannot be written. The message names it.
+        UserError: The bag exists or cannot be written. The message names it.
     """
     try:
         if output is not None:
@@ -361,7 +361,7 @@ def open_recording(
     except OSError as error:
         where = output or 'this directory'
         why = error.strerror.lower() if error.strerror else str(error)
-        raise OSError(f'cannot record to {where}: {why}') from error
+        raise UserError(f'cannot record to {where}: {why}') from error
     raise AssertionError('there is always another name')
 
 

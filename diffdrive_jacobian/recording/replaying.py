@@ -30,6 +30,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from diffdrive_jacobian.bags.bag_reader import BagError, messages, open_bag
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, message_class
+from diffdrive_jacobian.errors import NotDoneError
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.names import base_name, namespace_of, node_of
 from diffdrive_jacobian.recording.progress import ReplayProgress
@@ -60,7 +61,7 @@ MATCH_QUIET = 0.5
 """Time for which the numbers of subscriptions must not have changed before playback starts (s)."""
 
 
-class NothingToPlayError(BagError):
+class NothingToPlayError(BagError, NotDoneError):
     """The bag is readable, but has no message of the selected topics."""
 
 

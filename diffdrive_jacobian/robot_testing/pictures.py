@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from diffdrive_jacobian.bags import BagError, read_run
-from diffdrive_jacobian.plots.run_figure import ViolationMark, draw
+from diffdrive_jacobian.plots.rendering import write
+from diffdrive_jacobian.plots.run_panels import ViolationMark
+from diffdrive_jacobian.plots.run_pictures import run_figure
 
 
 def draw_run(bag: Path, picture: Path, marks: Sequence[tuple[int, str]]) -> str | None:
@@ -15,7 +17,7 @@ def draw_run(bag: Path, picture: Path, marks: Sequence[tuple[int, str]]) -> str 
         run = read_run(bag)
         if not len(run.odometry.values):
             return None
-        draw([run], picture, violations=[ViolationMark(*mark) for mark in marks])
+        write(run_figure(run, [ViolationMark(*mark) for mark in marks]), picture)
     except (BagError, ModuleNotFoundError, OSError) as error:
         return str(error)
     return ''

@@ -6,20 +6,26 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
-from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.errors import DiffdriveError, InterruptionError, NotDoneError, UserError
+from diffdrive_jacobian.plots.output_files import cannot_write, create
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools.entry_points import FAILED, INTERRUPTED, USER_ERROR
+from diffdrive_jacobian.tools.entry_points import FAILED, INTERRUPTED, OUTPUT_ERROR, USER_ERROR
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from rich.progress import TaskID
 
     from diffdrive_jacobian.bags.bag_writer import Summary
 
+Main: TypeAlias = Callable[[Sequence[str], Signals], int]
+"""What a tool does with its arguments; returns the exit code."""
 NO_MATPLOTLIB = "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'"
 PERIOD = 3.0
 """Time between two messages about a wait (s)."""
@@ -40,15 +46,71 @@ def note(program: str, message: object) -> None:
     print(f'{program}: {printable(message, PATH_LIMIT)}', file=sys.stderr)
 
 
-def interrupted(program: str, result: str = '') -> int:
-    """Print that a signal was caught, and what became of the files; return the exit code."""
-    note(program, f'interrupted{f": {result}" if result else ""}')
-    return INTERRUPTED
+def tool(program: str) -> Callable[[Main], Main]:
+    """Return a decorator of the `main` of a tool: what it raises becomes a message and an exit code."""
+
+    def decorate(main: Main) -> Main:
+        @wraps(main)
+        def run(arguments: Sequence[str], signals: Signals) -> int:
+            try:
+                return main(arguments, signals)
+            except InterruptionError as error:
+                note(program, f'interrupted{f": {error}" if str(error) else ""}')
+                return INTERRUPTED
+            except NotDoneError as error:
+                return complain(program, error, FAILED)
+            except DiffdriveError as error:
+                return complain(program, error)
+
+        return run
+
+    return decorate
 
 
-def cannot_write(program: str, path: object, error: OSError, result: str = '') -> int:
-    """Print that a file cannot be written, and what was written instead; return the exit code."""
-    return complain(program, f'{path} cannot be written: {error.strerror or error}{result}', FAILED)
+def say(path: Path) -> None:
+    """Print the path of a file that was written.
+
+    Raises:
+        NotDoneError: The standard output, which need not be buffered, cannot be written.
+    """
+    try:
+        print(printable(path, PATH_LIMIT))
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise NotDoneError(f'{OUTPUT_ERROR}: {error.strerror}') from error
+
+
+def check(signals: Signals, result: str = '') -> None:
+    """Raise InterruptionError if a signal was caught, with what became of the files."""
+    if signals.count:
+        raise InterruptionError(result)
+
+
+def drawn(
+    program: str, signals: Signals, ending: str, make: Callable[[], Figure], hint: str = ''
+) -> bytes:
+    """Return the content of a file with a figure. A signal ends the process meanwhile.
+
+    Raises:
+        UserError: matplotlib is not installed; the hint is at the end of the message.
+    """
+    from diffdrive_jacobian.plots.rendering import render
+
+    with explaining_no_matplotlib(hint), busy(program, 'drawing'), signals.ending_at_once():
+        return render(make(), ending)
+
+
+def write(path: Path, content: bytes, *, replace: bool) -> None:
+    """Write a new file.
+
+    Raises:
+        NotDoneError: It cannot be written.
+    """
+    try:
+        create(path, content, replace=replace)
+    except OSError as error:
+        raise cannot_write(path, error) from error
 
 
 @contextmanager

@@ -7,8 +7,7 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
-from diffdrive_jacobian.calibration import Calibration, CalibrationError, Geometry, Given, calibrate
+from diffdrive_jacobian.calibration import Calibration, Geometry, Given, calibrate
 from diffdrive_jacobian.calibration.data import (
     WheelsAndReference,
     read_wheels_and_reference,
@@ -19,14 +18,14 @@ from diffdrive_jacobian.calibration.description import (
     parameter_file,
 )
 from diffdrive_jacobian.calibration.model import GIVEN_NOISE
-from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.errors import NotDoneError, UserError
 from diffdrive_jacobian.numerics.checks import between
-from diffdrive_jacobian.plots.calibration_figure import draw
-from diffdrive_jacobian.plots.output_files import create, new_file
+from diffdrive_jacobian.plots.calibration_pictures import calibration_figure
+from diffdrive_jacobian.plots.output_files import cannot_write, create, new_file
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.text import PATH_LIMIT, printable
+from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.tools import _cli, _output
-from diffdrive_jacobian.tools.entry_points import DONE, FAILED
+from diffdrive_jacobian.tools.entry_points import DONE
 
 PROGRAM = 'calibrate_run'
 ENDINGS = ('yaml', 'yml')
@@ -36,44 +35,37 @@ GIVEN = ('yaw_offset', 'time_offset', 'wheel_noise', 'position_noise', 'heading_
 """Options that are fields of `Given`."""
 
 
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
     options = _parser().parse(arguments, ros=False)
-    try:
-        bags = _cli.given_bags(options)
-        output, picture = _outputs(options, bags)
-        read: list[WheelsAndReference] = []
-        for bag in bags:
-            read.append(
-                read_wheels_and_reference(
-                    bag,
-                    wheels=options.wheels_topic,
-                    reference=options.reference,
-                    names=None if options.wheels is None else tuple(options.wheels),
-                    interrupted=lambda: signals.count > 0,
-                )
+    bags = _cli.given_bags(options)
+    output, picture = _outputs(options, bags)
+    read: list[WheelsAndReference] = []
+    for bag in bags:
+        read.append(
+            read_wheels_and_reference(
+                bag,
+                wheels=options.wheels_topic,
+                reference=options.reference,
+                names=None if options.wheels is None else tuple(options.wheels),
+                interrupted=lambda: signals.count > 0,
             )
-            for note in read[-1].notes:
-                _output.note(PROGRAM, f'{bag}: {note}')
-        nominal = _nominal(options, read)
-    except ReadingInterruptedError:
-        return _output.interrupted(PROGRAM, 'nothing was written')
-    except (BagError, UserError, ValueError, OSError) as error:
-        return _output.complain(PROGRAM, error)
+        )
+        for note in read[-1].notes:
+            _output.note(PROGRAM, f'{bag}: {note}')
+    nominal = _nominal(options, read)
     lever_arm = None if options.lever_arm is None else tuple(options.lever_arm)
     given = Given(lever_arm=lever_arm, **{name: getattr(options, name) for name in GIVEN})
-    try:
-        result = calibrate([one.recording for one in read], nominal, given)
-    except CalibrationError as error:
-        return _output.complain(PROGRAM, error, FAILED)
+    result = calibrate([one.recording for one in read], nominal, given)
     for note in result.notes:
         _output.note(PROGRAM, note)
-    if signals.count:
-        return _output.interrupted(PROGRAM, 'nothing was written')
+    _output.check(signals, 'nothing was written')
     _print_summary(result, read)
     if missing := explain_undetermined(result):
-        return _output.complain(PROGRAM, f'{missing}. Nothing was written', FAILED)
-    return _write(result, read, output, picture, replace=options.force)
+        raise NotDoneError(f'{missing}. Nothing was written')
+    _write(result, read, output, picture, signals, replace=options.force)
+    return DONE
 
 
 def _print_summary(result: Calibration, read: Sequence[WheelsAndReference]) -> None:
@@ -95,16 +87,17 @@ def _write(
     read: Sequence[WheelsAndReference],
     output: Path,
     picture: Path | None,
+    signals: Signals,
     *,
     replace: bool,
-) -> int:
-    """Write the parameter file and the picture, and return the exit code."""
+) -> None:
+    """Write the parameter file and the picture, and print their names."""
     names = ', '.join(printable(Path(one.recording.name).name) for one in read)
     files: list[tuple[Path, bytes]] = [(output, parameter_file(result, names).encode())]
     if picture is not None:
         try:
-            with _output.explaining_no_matplotlib():
-                files.append((picture, draw(result, 'png')))
+            drawn = _output.drawn(PROGRAM, signals, 'png', lambda: calibration_figure(result))
+            files.append((picture, drawn))
         except UserError as error:
             _output.note(PROGRAM, f'not drawn: {error}')
     done: list[Path] = []
@@ -118,20 +111,17 @@ def _write(
             else:
                 for one in done:
                     one.unlink(missing_ok=True)
-            return _output.cannot_write(PROGRAM, path, error, what)
+            raise cannot_write(path, error, what) from error
         done.append(path)
     for path in done:
-        print(printable(path, PATH_LIMIT))
-    return DONE
+        _output.say(path)
 
 
 def _outputs(options: argparse.Namespace, bags: Sequence[Path]) -> tuple[Path, Path | None]:
     """Return the paths of the parameter file and of the picture.
 
     Raises:
-        FileExistsError: One of them exists, and must not be replaced.
-        OSError: One of them cannot be written.
-        ValueError: The parameter file has another ending.
+        UserError, NotDoneError: As for `new_file`.
     """
     name = options.output
     if name is None:
@@ -149,8 +139,7 @@ def _nominal(options: argparse.Namespace, read: Sequence[WheelsAndReference]) ->
     """Return the nominal dimensions, of the options or of the parameters in the bags.
 
     Raises:
-        UserError: They are unknown, or differ between the bags.
-        ValueError: They are out of range.
+        UserError: They are unknown, out of range, or differ between the bags.
     """
     radius, separation = options.wheel_radius, options.wheel_separation
     if radius is None or separation is None:
@@ -169,8 +158,11 @@ def _nominal(options: argparse.Namespace, read: Sequence[WheelsAndReference]) ->
         known = recorded.pop()
         radius = known[0] if radius is None else radius
         separation = known[1] if separation is None else separation
-    between(*RADIUS_BOUNDS, unit='m')('the wheel radius', radius)
-    between(*SEPARATION_BOUNDS, unit='m')('the wheel separation', separation)
+    try:
+        between(*RADIUS_BOUNDS, unit='m')('the wheel radius', radius)
+        between(*SEPARATION_BOUNDS, unit='m')('the wheel separation', separation)
+    except ValueError as error:
+        raise UserError(str(error)) from error
     return Geometry(wheel_radius=radius, wheel_separation=separation)
 
 

@@ -15,7 +15,6 @@ from diffdrive_jacobian.diagnosis.machine import (
     environment,
     shared_memory,
 )
-from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import how_to_get_ros, printable
 from diffdrive_jacobian.tools import _cli, _output
@@ -45,6 +44,7 @@ class Diagnosis:
         return [one for one in self.findings if one.problem]
 
 
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     options = _parser().parse(arguments)
@@ -58,8 +58,6 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     if usable:
         try:
             rmw, graph = _observe(options, signals)
-        except UserError as error:
-            return _output.complain(PROGRAM, error)
         except (ImportError, OSError, RuntimeError) as error:
             why = printable(' '.join(str(error).split()), 300)
             findings.append(Problem(f'ROS cannot be used: {why}', how_to_get_ros()))

@@ -33,6 +33,7 @@ DRIVES = 'whoever knows this address can steer the robot; it goes on after the g
 Goals: TypeAlias = NDArray[np.float64] | PlannedPath
 
 
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     parser = _parser()
@@ -52,16 +53,13 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         goals = waypoints_through(np.reshape(options.coordinates, (-1, 2)), heading or 0.0)
     recording = None
     if not options.no_record:
-        try:
-            recording = open_recording(
-                'drive', options.output, lossless=options.lockstep, replace=options.force
-            )
-        except OSError as error:
-            return _output.complain(PROGRAM, error)
+        recording = open_recording(
+            'drive', options.output, lossless=options.lockstep, replace=options.force
+        )
     picture = None if recording is None or options.no_plot or options.live else _picture(recording)
     if recording is not None and picture and os.path.lexists(picture) and not options.force:
         recording.discard()
-        return _output.complain(PROGRAM, f'{picture} exists already; {NOT_OVERWRITTEN}')
+        raise UserError(f'{picture} exists already; {NOT_OVERWRITTEN}')
     ros = ['--ros-args', '--log-level', 'warn', '--', *options.ros]
     how: dict[str, Any] = {
         'relative': path is not None and _cli.is_relative(options.path),
@@ -74,22 +72,17 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         'signals': signals,
     }
     code = FAILED
-    try:
-        with saved_on_error(recording):
-            try:
-                if options.live:
-                    code = _drive_with_page(goals, options, how)
-                else:
-                    with closing(_Progress(goals, options, ros)) as progress:
-                        outcome = drive(goals, timeout=options.timeout, progress=progress, **how)
-                    code = _print_outcome(outcome, options)
-            except DriveError as error:
-                # The recording shows what led to it.
-                _output.complain(PROGRAM, error)
-    except watch_run.PageError as error:
-        return _output.complain(PROGRAM, error, FAILED)
-    except UserError as error:
-        return _output.complain(PROGRAM, error)
+    with saved_on_error(recording):
+        try:
+            if options.live:
+                code = _drive_with_page(goals, options, how)
+            else:
+                with closing(_Progress(goals, options, ros)) as progress:
+                    outcome = drive(goals, timeout=options.timeout, progress=progress, **how)
+                code = _print_outcome(outcome, options)
+        except DriveError as error:
+            # The recording shows what led to it.
+            _output.complain(PROGRAM, error)
     if recording is None:
         return code
     saved = _save(recording, picture, replace=options.force)
@@ -186,7 +179,8 @@ def _save(recording: Recording, picture: Path | None, *, replace: bool) -> int:
     """Write the bag and its picture, and print their names; return the exit code."""
     from diffdrive_jacobian.bags.bag_reader import BagError
     from diffdrive_jacobian.bags.run import read_run
-    from diffdrive_jacobian.plots.run_figure import draw
+    from diffdrive_jacobian.plots.rendering import write
+    from diffdrive_jacobian.plots.run_pictures import run_figure
     from diffdrive_jacobian.recording.recording import RecordingError
 
     code = DONE
@@ -203,7 +197,7 @@ def _save(recording: Recording, picture: Path | None, *, replace: bool) -> int:
         return code
     try:
         with _output.busy(PROGRAM, f'drawing {picture}'):
-            draw([read_run(recording.bag)], picture, replace=replace)
+            write(run_figure(read_run(recording.bag)), picture, replace=replace)
         print(f'drawn: {picture}')
     except ModuleNotFoundError:
         print(f'not drawn: {_output.NO_MATPLOTLIB}')

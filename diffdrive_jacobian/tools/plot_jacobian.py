@@ -5,19 +5,20 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from diffdrive_jacobian import plots
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.numerics.checks import short
-from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, new_file
-from diffdrive_jacobian.plots.rendering import render, styled
+from diffdrive_jacobian.plots.output_files import FORMATS, extension, new_file
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.tools import _cli, _output
 from diffdrive_jacobian.tools.entry_points import DONE
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from diffdrive_jacobian.kinematics.spatial_arm import SpatialArm
 
 PROGRAM = 'plot_jacobian'
@@ -30,29 +31,23 @@ OPTIONS = {
 PARAMETERS = {'a', 'alpha', 'd', 'theta', 'prismatic'}
 
 
-def main(arguments: Sequence[str], signals: Signals) -> int:
+@_output.tool(PROGRAM)
+def main(words: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     parser = _parser()
-    options = parser.parse(arguments, ros=False)
+    options = parser.parse(words, ros=False)
     _check(parser, options)
     output = f'{options.name}.png' if options.output is None else options.output
-    try:
-        path = new_file(output, FORMATS, 'picture', replace=options.force)
-        with (
-            _output.explaining_no_matplotlib(),
-            _output.busy(PROGRAM, 'drawing'),
-            signals.ending_at_once(),
-            styled(),
-        ):
-            drawing = getattr(plots, options.name)(**_arguments(options))
-            content = render(drawing, extension(path))
-        if signals.count:
-            return _output.interrupted(PROGRAM, 'nothing was written')
-        create(path, content, replace=options.force)
-    except (ValueError, UserError, FileExistsError) as error:
-        return _output.complain(PROGRAM, error)
-    except OSError as error:
-        return _output.cannot_write(PROGRAM, output, error)
+    path = new_file(output, FORMATS, 'picture', replace=options.force)
+    arguments = _arguments(options)
+
+    def draw() -> Figure:
+        try:
+            return cast('Figure', getattr(plots, options.name)(**arguments))
+        except ValueError as error:
+            raise UserError(str(error)) from error
+
+    _output.write(path, _output.drawn(PROGRAM, signals, extension(path), draw), replace=options.force)
     print(path)
     return DONE
 

@@ -4,94 +4,70 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
-from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.bags.run import Run, read_run
+from diffdrive_jacobian.bags.summary import summary, table_of
 from diffdrive_jacobian.bags.table import DECIMALS, csv_text
-from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.topics import READABLE
-from diffdrive_jacobian.plots.output_files import FORMATS, check_directory, create, new_file
-from diffdrive_jacobian.plots.run_figure import draw, names
+from diffdrive_jacobian.plots.output_files import (
+    FORMATS,
+    cannot_write,
+    check_directory,
+    extension,
+    new_file,
+)
+from diffdrive_jacobian.plots.run_pictures import names_of, run_figure
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli, _output
-from diffdrive_jacobian.tools.entry_points import DONE, FAILED, OUTPUT_ERROR
+from diffdrive_jacobian.tools.entry_points import DONE
 
 PROGRAM = 'plot_run'
 
 
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
     options = _parser().parse(arguments, ros=False)
-    try:
-        bags = _cli.given_bags(options)
-        given = [name for name, _ in options.topics]
-        if repeated := [name for name in given if given.count(name) > 1]:
-            raise UserError(f'--topic can be given once for each name, got {repeated[0]} again')
-        picture, tables = _picture(options, bags), _tables(options, bags)
-    except (UserError, ValueError, FileExistsError) as error:
-        return _output.complain(PROGRAM, error)
-    except OSError as error:
-        return _output.cannot_write(PROGRAM, error.filename, error)
-    runs: list[Run] = []
-    try:
-        for bag in bags:
-            with _output.busy(PROGRAM, f'reading {bag}'):
-                runs.append(
-                    read_run(
-                        bag,
-                        dict(options.topics),
-                        namespace=options.namespace,
-                        interrupted=lambda: signals.count > 0,
-                    )
-                )
-            # A run without odometry is reported before the others are read.
-            timeline(runs[-1])
-            for note in runs[-1].notes:
-                _output.note(PROGRAM, f'{bag}: {note}')
-            if signals.count:
-                return _output.interrupted(PROGRAM)
-        with _output.explaining_no_matplotlib():
-            return _write(runs, picture, tables, signals, replace=options.force)
-    except ReadingInterruptedError:
-        return _output.interrupted(PROGRAM)
-    except (BagError, UserError) as error:
-        return _output.complain(PROGRAM, error)
-
-
-def _write(
-    runs: Sequence[Run], picture: Path, tables: Sequence[Path], signals: Signals, *, replace: bool
-) -> int:
-    """Write the picture, then the tables, and return the exit code."""
-    # Drawing takes a second.
-    writers = [partial(draw, runs, picture, replace=replace, drawing=signals.ending_at_once())]
-    writers += [
-        partial(_write_table, *pair, replace=replace) for pair in zip(runs, tables, strict=bool(tables))
-    ]
-    for path, write in zip([picture, *tables], writers, strict=True):
-        if signals.count:
-            return _output.interrupted(PROGRAM)
-        try:
-            with _output.busy(PROGRAM, f'writing {path}'):
-                write()
-        except OSError as error:
-            return _output.cannot_write(PROGRAM, path, error)
-        try:
-            print(printable(path, PATH_LIMIT))
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            # It is not buffered.
-            return _output.complain(PROGRAM, f'{OUTPUT_ERROR}: {error.strerror}', FAILED)
+    bags = _cli.given_bags(options)
+    given = [name for name, _ in options.topics]
+    if repeated := [name for name in given if given.count(name) > 1]:
+        raise UserError(f'--topic can be given once for each name, got {repeated[0]} again')
+    picture, tables = _picture(options, bags), _tables(options, bags)
+    runs, found = [], []
+    for bag in bags:
+        with _output.busy(PROGRAM, f'reading {bag}'):
+            run = read_run(
+                bag,
+                dict(options.topics),
+                namespace=options.namespace,
+                interrupted=lambda: signals.count > 0,
+            )
+        runs.append(run)
+        # A run without odometry is reported before the others are read.
+        found.append(summary(run.timeline()))
+        for note in run.notes:
+            _output.note(PROGRAM, f'{bag}: {note}')
+        _output.check(signals)
+    content = _output.drawn(PROGRAM, signals, extension(picture), lambda: run_figure(runs))
+    _output.write(picture, content, replace=options.force)
+    _output.say(picture)
+    for run, path in zip(runs, tables, strict=bool(tables)):
+        _output.check(signals)
+        with _output.busy(PROGRAM, f'writing {path}'):
+            _write_table(run, path, replace=options.force)
+        _output.say(path)
+    print(*table_of(names_of(bags), found), sep='\n')
     return DONE
 
 
 def _write_table(run: Run, path: Path, *, replace: bool) -> None:
-    path.parent.mkdir(exist_ok=True)
-    create(path, csv_text(run).encode(), replace=replace)
+    try:
+        path.parent.mkdir(exist_ok=True)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    _output.write(path, csv_text(run).encode(), replace=replace)
 
 
 def _picture(options: argparse.Namespace, bags: Sequence[Path]) -> Path:
@@ -99,7 +75,7 @@ def _picture(options: argparse.Namespace, bags: Sequence[Path]) -> Path:
 
     Raises:
         UserError: It is a directory.
-        ValueError, FileExistsError, OSError: As for `new_file`.
+        UserError, NotDoneError: As for `new_file`.
     """
     output = options.output
     if output is None:
@@ -123,7 +99,7 @@ def _tables(options: argparse.Namespace, bags: Sequence[Path]) -> list[Path]:
 
     Raises:
         UserError: `--csv` is neither a CSV file nor a directory.
-        FileExistsError, OSError: As for `new_file`.
+        UserError, NotDoneError: As for `new_file`.
     """
     output = options.csv
     if output is None:
@@ -132,7 +108,7 @@ def _tables(options: argparse.Namespace, bags: Sequence[Path]) -> list[Path]:
     if path.is_dir() or output.endswith('/') or not path.suffix:
         if path.exists() and not path.is_dir():
             raise UserError(f'{path} exists already; a CSV file ends in .csv')
-        tables = [path / f'{label.replace("/", "_")}.csv' for label in names(bags)]
+        tables = [path / f'{label.replace("/", "_")}.csv' for label in names_of(bags)]
     elif path.suffix.lower() != '.csv':
         raise UserError(
             f'--csv must be a file that ends in .csv or a directory, got {output!r} (a directory exists '
@@ -149,8 +125,7 @@ def _tables(options: argparse.Namespace, bags: Sequence[Path]) -> list[Path]:
         try:
             check_directory(table.parent.parent)
         except OSError as error:
-            error.filename = str(table)
-            raise
+            raise cannot_write(table, error) from error
     return tables
 
 
@@ -168,7 +143,9 @@ def _parser() -> _cli.Parser:
         prog=PROGRAM,
         description='Draw runs that record_run or ros2 bag record has written: the path with its goals, '
         'and over time the distance to the goal, the bearing error, the speeds and their limits. '
-        'Several runs are drawn into the same axes. Existing files are not overwritten without --force. '
+        'Several runs are drawn into the same axes, from their first goals on. Durations, lengths and '
+        'the greatest errors and speeds are printed. Existing files are not overwritten without '
+        '--force. '
         'Exit code 0: drawn; 1: a file cannot be written; 2: wrong arguments, or a bag cannot be read; '
         '130: interrupted.',
     )

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.errors import NotDoneError
 from diffdrive_jacobian.messages.topics import RUN_TOPICS, Selection
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli, _output
 from diffdrive_jacobian.tools._output import counted, describe_bag
-from diffdrive_jacobian.tools.entry_points import DONE, FAILED, long_lived
+from diffdrive_jacobian.tools.entry_points import DONE, long_lived
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.recording.recorder import Status
@@ -82,6 +82,7 @@ class StatusLine:
             print()
 
 
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     parser = _parser()
@@ -101,10 +102,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         everything=options.all,
         pattern=options.regex or '',
     )
-    try:
-        recording = open_recording('run', options.output, replace=options.force)
-    except OSError as error:
-        return _output.complain(PROGRAM, error)
+    recording = open_recording('run', options.output, replace=options.force)
     bag = recording.bag
     print(f'recording to {printable(bag, PATH_LIMIT)}; Ctrl-C ends it', flush=True)
     # A word that is meant as the name of the bag is read as that of a topic.
@@ -125,16 +123,14 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         finally:
             ending.close()
             line.end()
-    except UserError as error:
-        return _output.complain(PROGRAM, error)
     except RecordingError as error:
         if error.summary is not None:
             print(describe_bag(bag, error.summary, 'incomplete'))
-        return _output.complain(PROGRAM, error, FAILED)
+        raise
     print(describe_bag(bag, summary))
     if topics and not summary.messages:
         reason = line.missing or f'no message was received on {", ".join(topics)}'
-        return _output.complain(PROGRAM, reason, FAILED)
+        raise NotDoneError(reason)
     if topics and line.never_published:
         _output.note(PROGRAM, f'warning: no publisher: {_listed(line.never_published)}')
     return DONE

@@ -8,13 +8,12 @@ from pathlib import Path
 
 from diffdrive_jacobian.bags.recovery import (
     RECOVERED,
-    NotABagError,
     NothingToSaveError,
     Recovery,
-    RecoveryInterruptedError,
     UncheckedError,
     recover,
 )
+from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.tools import _cli, _output
@@ -29,6 +28,7 @@ MAX_LINE = 400
 """Length of the line of each."""
 
 
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
     options = _parser().parse(arguments, ros=False)
@@ -40,15 +40,13 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 replace=options.force,
                 interrupted=lambda: signals.count > 0,
             )
-    except RecoveryInterruptedError:
-        return _output.interrupted(PROGRAM, 'no bag was written')
     except NothingToSaveError as error:
         reason, *losses = error.args
         _output.note(PROGRAM, reason)
         print(*_listed(losses), sep='\n', end='\n' if losses else '', file=sys.stderr)
         return UNCHECKED if isinstance(error, UncheckedError) else FAILED
-    except (NotABagError, FileExistsError) as error:
-        return _output.complain(PROGRAM, error)
+    except FileExistsError as error:
+        raise UserError(str(error)) from error
     except OSError as error:
         wrong = isinstance(error, PermissionError | FileNotFoundError | NotADirectoryError)
         code = USER_ERROR if wrong else FAILED

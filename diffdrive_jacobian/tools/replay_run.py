@@ -9,8 +9,6 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.recording.progress import ReplayProgress
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _output
@@ -25,6 +23,7 @@ MATCH_PATIENCE = 5.0
 """Longest wait for subscriptions without -w (s): an older participant is announced every 3 s."""
 
 
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
@@ -42,40 +41,33 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     parser.refuse_with(options, '--wait-for-all-acked', '--loop')
     if options.start_paused and not (sys.stdin and sys.stdin.isatty()):
         parser.error('--start-paused needs a terminal: Enter resumes')
-    # Not above: --help needs no ROS.
-    from diffdrive_jacobian.bags.bag_reader import BagError
-
     with long_lived(), signals.ending_at_once():
-        from diffdrive_jacobian.recording import COMMANDS, GOALS, NothingToPlayError, Playback, replay
+        # Not above: --help needs no ROS.
+        from diffdrive_jacobian.recording import COMMANDS, GOALS, Playback, replay
 
     acked = options.wait_for_all_acked
-    try:
-        playback = Playback(
-            names=None if options.all_topics else GOALS if options.goals else COMMANDS,
-            topics=tuple(options.topics or ()),
-            namespace=options.namespace,
-            remap=dict(options.remap),
-            rate=options.rate,
-            start_offset=options.start_offset,
-            loop=options.loop,
-            clock=options.clock,
-            paused=options.start_paused,
-        )
-        result = replay(
-            options.bag,
-            playback,
-            patience=MATCH_PATIENCE,
-            readers=options.readers,
-            timeout=math.inf if options.timeout is None else options.timeout,
-            acknowledgement_timeout=None if acked is None else acked / 1000.0,
-            ros_arguments=options.ros,
-            signals=signals,
-            progress=_Progress(),
-        )
-    except NothingToPlayError as error:
-        return _output.complain(PROGRAM, error, FAILED)
-    except (UserError, BagError, ParameterError) as error:
-        return _output.complain(PROGRAM, error)
+    playback = Playback(
+        names=None if options.all_topics else GOALS if options.goals else COMMANDS,
+        topics=tuple(options.topics or ()),
+        namespace=options.namespace,
+        remap=dict(options.remap),
+        rate=options.rate,
+        start_offset=options.start_offset,
+        loop=options.loop,
+        clock=options.clock,
+        paused=options.start_paused,
+    )
+    result = replay(
+        options.bag,
+        playback,
+        patience=MATCH_PATIENCE,
+        readers=options.readers,
+        timeout=math.inf if options.timeout is None else options.timeout,
+        acknowledgement_timeout=None if acked is None else acked / 1000.0,
+        ros_arguments=options.ros,
+        signals=signals,
+        progress=_Progress(),
+    )
     return _report(result, options)
 
 

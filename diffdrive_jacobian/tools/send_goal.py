@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
-from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _output
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
 PROGRAM = 'send_goal'
 
 
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     parser = _parser()
@@ -60,21 +60,18 @@ def send(
         arguments: Further arguments of `sending`.
     """
     options.timeout = math.inf if options.timeout is None else options.timeout
-    try:
-        with closing(Progress(program, what)) as progress:
-            result = sending(
-                frame=options.frame,
-                readers=options.readers or 1,
-                patience=options.wait,
-                timeout=options.timeout,
-                follow=not options.no_wait,
-                ros_arguments=options.ros,
-                signals=signals,
-                progress=progress,
-                **arguments,
-            )
-    except UserError as error:
-        return _output.complain(program, error)
+    with closing(Progress(program, what)) as progress:
+        result = sending(
+            frame=options.frame,
+            readers=options.readers or 1,
+            patience=options.wait,
+            timeout=options.timeout,
+            follow=not options.no_wait,
+            ros_arguments=options.ros,
+            signals=signals,
+            progress=progress,
+            **arguments,
+        )
     print(*report(result, options, what), sep='\n')
     if result.interrupted:
         return INTERRUPTED

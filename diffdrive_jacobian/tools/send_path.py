@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools import _cli, _output
 from diffdrive_jacobian.tools.entry_points import long_lived
 from diffdrive_jacobian.tools.send_goal import add_options, send
 
 PROGRAM = 'send_path'
 
 
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     parser = _parser()

@@ -10,12 +10,12 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from diffdrive_jacobian.control import Controller, ControllerError
+from diffdrive_jacobian.control import Controller
 from diffdrive_jacobian.control.controllers import CONTROLLERS
-from diffdrive_jacobian.errors import DiffdriveError, UserError
+from diffdrive_jacobian.errors import NotDoneError, UserError
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
-from diffdrive_jacobian.plots import sweep_figure
-from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, free_stem, new_file
+from diffdrive_jacobian.plots.output_files import FORMATS, extension, free_stem, new_file
+from diffdrive_jacobian.plots.sweep_pictures import sweep_figure
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel
 from diffdrive_jacobian.simulation.gain_sweep import (
@@ -27,64 +27,47 @@ from diffdrive_jacobian.simulation.gain_sweep import (
     sweep_table,
 )
 from diffdrive_jacobian.tools import _cli, _output
-from diffdrive_jacobian.tools.entry_points import DONE
+from diffdrive_jacobian.tools.entry_points import DONE, FAILED
 
 PROGRAM = 'sweep_gains'
+NOTHING = 'nothing was written'
 
 
-class SweepInterruptedError(DiffdriveError):
-    """A signal was caught."""
-
-
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
-    try:
-        parser = _parser(_controller(arguments))
-    except (ControllerError, argparse.ArgumentError) as error:
-        return _output.complain(PROGRAM, error)
+    parser = _parser(_controller(arguments))
     options = parser.parse(arguments, ros=False)
     parser.refuse_without(options, '--force', '--output', '--csv')
-    try:
-        # Before the sweep, which takes a while.
+    # Before the sweep, which takes a while.
+    picture, table = _files(options)
+    _output.check(signals, NOTHING)
+    if picture is not None:
+        # Slow.
+        with _output.explaining_no_matplotlib('; the table alone, --csv FILE, does not need it'):
+            importlib.import_module('matplotlib.figure')
+    swept = _sweep(options, signals)
+    drawn = b''
+    if picture is not None:
+        drawn = _output.drawn(PROGRAM, signals, extension(picture), lambda: sweep_figure(swept))
+    rows = b'' if table is None else sweep_table(swept).encode()
+    _output.check(signals, NOTHING)
+    if options.output is None and options.csv is None:
+        # Other processes that started in the same second may have taken the names meanwhile.
         picture, table = _files(options)
-        _check(signals)
-        if picture is not None:
-            # Slow.
-            with _output.explaining_no_matplotlib('; the table alone, --csv FILE, does not need it'):
-                importlib.import_module('matplotlib.figure')
-        swept = _sweep(options, signals)
-        with _output.busy(PROGRAM, 'drawing'):
-            drawn = b'' if picture is None else sweep_figure.draw(swept, extension(picture))
-        rows = b'' if table is None else sweep_table(swept).encode()
-        _check(signals)
-        if options.output is None and options.csv is None:
-            # Other processes that started in the same second may have taken the names meanwhile.
-            picture, table = _files(options)
-    except SweepInterruptedError:
-        return _output.interrupted(PROGRAM, 'nothing was written')
-    except (ValueError, UserError, FileExistsError) as error:
-        return _output.complain(PROGRAM, error)
-    except OSError as error:
-        return _output.cannot_write(PROGRAM, error.filename, error)
     code, written = DONE, []
     for path, content in ((table, rows), (picture, drawn)):
         if path is None:
             continue
         try:
-            create(path, content, replace=options.force)
+            _output.write(path, content, replace=options.force)
             written.append(path)
-        except OSError as error:
+        except NotDoneError as error:
             # The other file is still written.
-            code = _output.cannot_write(PROGRAM, path, error)
+            code = _output.complain(PROGRAM, error, FAILED)
     # Only now: the reader of the output may go away.
     print(*written, describe_sweep(swept), sep='\n')
     return code
-
-
-def _check(signals: Signals) -> None:
-    """Raise SweepInterruptedError if a signal was caught."""
-    if signals.count:
-        raise SweepInterruptedError
 
 
 def _controller(arguments: Sequence[str]) -> Controller:
@@ -103,7 +86,7 @@ def _files(options: argparse.Namespace) -> tuple[Path | None, Path | None]:
     """Return the files to write, the picture and the table. None: it is not written.
 
     Raises:
-        ValueError, FileExistsError, OSError: As for `new_file`.
+        UserError, NotDoneError: As for `new_file`.
     """
     output, csv, force = options.output, options.csv, options.force
     if output is None and csv is None:
@@ -119,36 +102,30 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
     """Sweep the gains, with a progress bar.
 
     Raises:
-        ValueError: The options are invalid together.
-        UserError: The parameter file is invalid.
-        SweepInterruptedError: A signal was caught.
+        UserError: The options are invalid together, the parameter file is, or the law cannot be swept.
+        InterruptionError: A signal was caught.
     """
     gains: dict[str, float | tuple[float, float]] = {}
     for gain in CONTROLLERS.find(options.controller).gains:
         values = getattr(options, f'gain_{gain.name}')
         if values is not None:
             gains[gain.name] = values[0] if len(values) == 1 else tuple(values)
-    setup = SweepSetup(
-        controller=options.controller,
-        gains=gains,
-        grid=options.grid,
-        starts=options.starts,
-        distance=options.distance,
-        rate=options.rate,
-        duration=options.duration,
-        tolerance=options.tolerance,
-        robot=_robot(options),
-    )
-    _check(signals)
-    started = time.monotonic()
-    with closing(_output.Bar()) as bar:
+    names = ('controller', 'grid', 'starts', 'distance', 'rate', 'duration', 'tolerance')
+    given = {name: getattr(options, name) for name in names}
+    robot, started = _robot(options), time.monotonic()
+    try:
+        setup = SweepSetup(gains=gains, robot=robot, **given)
+        _output.check(signals, NOTHING)
+        with closing(_output.Bar()) as bar:
 
-        def progress(done: int) -> None:
-            _check(signals)
-            seconds = time.monotonic() - started
-            bar.show('sweeping', done / setup.loops, f'{done} of {setup.loops}, {seconds:.0f} s')
+            def progress(done: int) -> None:
+                _output.check(signals, NOTHING)
+                seconds = time.monotonic() - started
+                bar.show('sweeping', done / setup.loops, f'{done} of {setup.loops}, {seconds:.0f} s')
 
-        return sweep(setup, progress)
+            return sweep(setup, progress)
+    except ValueError as error:
+        raise UserError(str(error)) from error
 
 
 def _robot(options: argparse.Namespace) -> RobotModel:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.bags.run import read_run
 from diffdrive_jacobian.bags.verification import (
     BY_RECORDING_TIME,
@@ -17,7 +16,6 @@ from diffdrive_jacobian.bags.verification import (
     verify,
 )
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.file import robot_parameters
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _output
@@ -73,6 +71,7 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
     return '\n'.join([*lines, verdict])
 
 
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
     return _run(PROGRAM, _parser().parse(arguments, ros=False), signals)
@@ -98,21 +97,16 @@ def _run(program: str, options: argparse.Namespace, signals: Signals) -> int:
     def interrupted() -> bool:
         return signals.count > 0
 
-    try:
-        parameters = None if options.params_file is None else robot_parameters(options.params_file)
-        with _output.busy(program, f'reading {options.bag}'):
-            run = read_run(options.bag, namespace=options.namespace, interrupted=interrupted)
-        if parameters is not None and len(run.cmd_vel_out):
-            raise UserError(
-                '--params-file and --robot have no effect: the bag has cmd_vel_out, the commands as the '
-                'robot applied them'
-            )
-        with _output.busy(program, 'simulating the run'):
-            verification = verify(run, parameters, interrupted=interrupted)
-    except (UserError, BagError, ParameterError) as error:
-        return _output.complain(program, error)
-    except ReadingInterruptedError:
-        return _output.interrupted(program)
+    parameters = None if options.params_file is None else robot_parameters(options.params_file)
+    with _output.busy(program, f'reading {options.bag}'):
+        run = read_run(options.bag, namespace=options.namespace, interrupted=interrupted)
+    if parameters is not None and len(run.cmd_vel_out):
+        raise UserError(
+            '--params-file and --robot have no effect: the bag has cmd_vel_out, the commands as the '
+            'robot applied them'
+        )
+    with _output.busy(program, 'simulating the run'):
+        verification = verify(run, parameters, interrupted=interrupted)
     allowed = verification.allowed
     tolerance = allowed if options.tolerance is None else options.tolerance
     yaw_tolerance = allowed if options.yaw_tolerance is None else options.yaw_tolerance

@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.errors import NotDoneError, UserError
 from diffdrive_jacobian.numerics.checks import between
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _output
-from diffdrive_jacobian.tools.entry_points import DONE, FAILED, long_lived
+from diffdrive_jacobian.tools.entry_points import DONE, long_lived
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.live.server import LiveServer
@@ -27,6 +27,7 @@ STEERS = 'whoever knows this address can steer the robot; Ctrl-C ends'
 PLAYS = 'the page plays the bag; Ctrl-C ends'
 
 
+@_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     parser = _parser()
@@ -35,36 +36,25 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         parser.error('--rate needs a BAG: running robots have their own time')
     if options.bag is not None and options.ros:
         parser.error('a BAG needs no ROS arguments')
-    try:
-        with explaining_page_errors(options.port):
-            return (_watch_nodes if options.bag is None else _play)(options, signals)
-    except PageError as error:
-        return _output.complain(PROGRAM, error, FAILED)
-    except UserError as error:
-        return _output.complain(PROGRAM, error)
-
-
-def _play(options: argparse.Namespace, signals: Signals) -> int:
-    from diffdrive_jacobian.bags.bag_reader import BagError
-    from diffdrive_jacobian.live.bag_player import watch_bag
-
-    print(f'reading {options.bag}', flush=True)
-    ready = announcing(options, notice=PLAYS)
-    try:
-        speed = options.rate or 1.0
-        watch_bag(options.bag, port=options.port, speed=speed, signals=signals, ready=ready)
-    except BagError as error:
-        return _output.complain(PROGRAM, error)
+    with explaining_page_errors(options.port):
+        (_watch_nodes if options.bag is None else _play)(options, signals)
     return DONE
 
 
-def _watch_nodes(options: argparse.Namespace, signals: Signals) -> int:
+def _play(options: argparse.Namespace, signals: Signals) -> None:
+    from diffdrive_jacobian.live.bag_player import watch_bag
+
+    print(f'reading {options.bag}', flush=True)
+    ready, speed = announcing(options, notice=PLAYS), options.rate or 1.0
+    watch_bag(options.bag, port=options.port, speed=speed, signals=signals, ready=ready)
+
+
+def _watch_nodes(options: argparse.Namespace, signals: Signals) -> None:
     with long_lived(), signals.ending_at_once():
         from diffdrive_jacobian.live.node import watch_nodes
 
     ready = announcing(options)
     watch_nodes(ros_arguments=options.ros, port=options.port, signals=signals, ready=ready)
-    return DONE
 
 
 # --- The page of a tool
@@ -94,8 +84,8 @@ def announcing(
     return announce
 
 
-class PageError(UserError):
-    """The page cannot be served."""
+class PageError(UserError, NotDoneError):
+    """The page cannot be served; nothing ran."""
 
 
 @contextmanager

@@ -46,8 +46,8 @@ from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.parameters.declaration import ParameterError
-from diffdrive_jacobian.plots.run_figure import LABELS
 from diffdrive_jacobian.plots.run_lines import commanded, limits, measured
+from diffdrive_jacobian.plots.run_panels import LABELS
 
 pytestmark = pytest.mark.usefixtures('quick_disk', 'bounded_memory')
 

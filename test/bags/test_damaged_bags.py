@@ -27,8 +27,8 @@ from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.recovery import UncheckedError
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.bags.verification import verify
-from diffdrive_jacobian.plots.run_figure import LABELS
 from diffdrive_jacobian.plots.run_lines import commanded, limits, measured
+from diffdrive_jacobian.plots.run_panels import LABELS
 from diffdrive_jacobian.safe_yaml import load_yaml
 from diffdrive_jacobian.tools import plot_run, recover_run, replay_run
 

@@ -24,11 +24,11 @@ from support.ros_messages import (
 from support.runs import built_run, sample, series
 
 from diffdrive_jacobian.bags import BagError, read_run
-from diffdrive_jacobian.bags.bag_reader import ReadingInterruptedError
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.bags.verification import verify
+from diffdrive_jacobian.errors import InterruptionError
 from diffdrive_jacobian.messages.codecs import FaultEvent
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 
@@ -244,6 +244,6 @@ def test_reading_and_verification_end_with_the_next_message(tmp_path, calls):
     run = read_run(bag)
     for function, given in ((read_run, bag), (verify, run)):
         answers = iter([False] * calls + [True])
-        with pytest.raises(ReadingInterruptedError):
+        with pytest.raises(InterruptionError):
             function(given, interrupted=lambda answers=answers: next(answers))
         assert next(answers, None) is None

@@ -22,7 +22,7 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.numerics.formula import formula
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
-from diffdrive_jacobian.plots.sweep_figure import figure
+from diffdrive_jacobian.plots import sweep_figure
 from diffdrive_jacobian.simulation import SweepSetup, closed_loops, sweep, sweep_table
 from diffdrive_jacobian.tools import sweep_gains
 
@@ -170,7 +170,7 @@ def test_three_gains_are_swept_two_at_a_time_and_drawn():
     how = {'arrival': setup.arrival, 'rate': 10.0}
     alone = closed_loops(POLAR, setup.poses(), np.zeros(3), 0.775, 1.5, -0.3, **how)
     np.testing.assert_array_equal(alone.time, swept.outcomes.time[0, 1])
-    drawn = figure(swept)
+    drawn = sweep_figure(swept)
     assert drawn.get_suptitle().startswith('polar: ')
     texts = [text.get_text() for text in drawn.axes[3].get_legend().get_texts()]
     assert 'defaults: k_rho 0.5, k_alpha 2' in texts

@@ -17,7 +17,6 @@ from diffdrive_jacobian import plots
 from diffdrive_jacobian.kinematics.spatial_arm import IIWA
 from diffdrive_jacobian.plots import arm_pictures, rendering, spatial_pictures
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import plot_jacobian
 from diffdrive_jacobian.tools.plot_jacobian import main
 
 LARGEST = 100_000
@@ -110,7 +109,8 @@ def test_the_columns_of_the_wheel_cancel_at_the_ground_and_the_feet_stand_on_it(
 
 
 def test_every_picture_is_public_and_in_the_documentation(folder, capsys):
-    assert {*plots.PICTURES, 'PICTURES', 'run_figure', 'sweep_figure'} == {*plots.__all__}
+    figures = {f'{what}_figure' for what in ('calibration', 'run', 'sweep')}
+    assert {*plots.PICTURES, 'PICTURES', *figures} == {*plots.__all__}
     table = (ROOT / 'doc' / 'documents.md').read_text().split('| name | shows |', 1)[1].split('\n\n')[0]
     assert dict(re.findall(r'^\| `(\w+)` \| (.*) \|$', table, re.MULTILINE)) == plots.PICTURES
     assert run('--help') == 0
@@ -152,7 +152,7 @@ def test_any_arm_is_drawn_at_one_configuration(folder, monkeypatch, options, axe
     (folder / 'arm.yaml').write_text(DH)
     (folder / 'slides.yaml').write_text(DH + 'theta: 0.1\nprismatic: [2]\n')
     drawn = []
-    monkeypatch.setattr(plot_jacobian, 'render', lambda figure, ending: drawn.append(figure) or b'')
+    monkeypatch.setattr(rendering, 'render', lambda figure, ending: drawn.append(figure) or b'')
     assert run('arm_at', *options) == 0
     (plane,) = drawn[0].axes
     assert axes in {plane.get_xlabel(), getattr(plane, 'get_zlabel', str)()}

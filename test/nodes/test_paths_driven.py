@@ -25,7 +25,7 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.plots.run_figure import figure
+from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.drive_to import main
@@ -64,11 +64,11 @@ def test_how_late_a_robot_is_that_is_too_slow_for_a_trajectory_is_said_everywher
     with open(tmp_path / 'run.csv') as file:
         *_, row = (row for row in csv.DictReader(file) if row['late_s'])
     assert float(row['late_s']) == pytest.approx(outcome.late, abs=0.05)
-    labels = [axes.get_ylabel() for axes in figure([one.run]).axes]
+    labels = [axes.get_title(loc='left') for axes in run_figure(one.run).axes]
     assert 'behind the times [s]' in labels
     quick, one = driven('quick', line_path(0.3).timed(0.2))
     assert 0.0 <= quick.late < 0.5
-    labels = [axes.get_ylabel() for axes in figure([one.run]).axes]
+    labels = [axes.get_title(loc='left') for axes in run_figure(one.run).axes]
     assert 'along path [m]' in labels
     assert 'behind the times [s]' not in labels
 
@@ -123,8 +123,9 @@ def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
     again = planned_path(str(tmp_path / 'run.csv'))
     assert again.length == pytest.approx(planned.length, abs=0.03)
     assert again.duration == pytest.approx(np.ptp(one.run.odometry.stamps) / 1e9)
-    plane, *panels = figure([one.run]).axes
-    assert [panel.get_ylabel() for panel in panels[:2]] == ['across path [m]', 'heading to path [rad]']
+    plane, *panels = run_figure(one.run).axes
+    titles = [panel.get_title(loc='left') for panel in panels[:2]]
+    assert titles == ['across path [m]', 'heading to path [rad]']
     assert any(np.allclose(np.ptp(line.get_data(), axis=1), 0.3, atol=1e-3) for line in plane.lines)
 
 

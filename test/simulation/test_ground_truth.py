@@ -18,7 +18,8 @@ from diffdrive_jacobian.messages.codecs import Changes
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
-from diffdrive_jacobian.plots.run_figure import COLOR, figure
+from diffdrive_jacobian.plots import run_figure
+from diffdrive_jacobian.plots.run_plane import COLOR
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.tools.verify_run import report
@@ -200,7 +201,7 @@ def test_without_the_dimensions_of_the_robot_the_odometry_alone_is_verified(run)
 
 
 def test_the_figure_shows_truth_and_odometry(run):
-    drawn = figure([run])
+    drawn = run_figure([run])
     shown, *_ = (
         path
         for line in drawn.axes[0].lines
@@ -209,5 +210,5 @@ def test_the_figure_shows_truth_and_odometry(run):
     # Broken where the robot was placed.
     assert np.count_nonzero(np.isnan(shown[:, 0])) == 1
     assert shown[~np.isnan(shown[:, 0])].tolist() == run.ground_truth.values[:, :2].tolist()
-    labels = [text.get_text() for text in drawn.axes[-1].get_legend().get_texts()]
-    assert 'ground truth and its end' in labels
+    labels = [text.get_text() for text in drawn.legends[0].get_texts()]
+    assert 'where the robot truly was' in labels

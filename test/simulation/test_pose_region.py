@@ -12,7 +12,7 @@ from support.runs import built_run, series
 
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.plots.run_figure import figure
+from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.plots.uncertainty import ELLIPSE_LABEL, REGION_LABEL, uncertainties
 from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
@@ -121,9 +121,8 @@ def test_the_regions_along_a_path_hold_95_percent_of_the_robots():
 
 
 def test_the_figure_has_the_region_and_the_ellipse():
-    drawn = figure([driven([((0.22, 0.0), 10.0)], rate=5)])
-    legends = filter(None, (axes.get_legend() for axes in drawn.axes))
-    labels = [text.get_text() for legend in legends for text in legend.get_texts()]
+    drawn = run_figure([driven([((0.22, 0.0), 10.0)], rate=5)])
+    labels = [text.get_text() for text in drawn.legends[0].get_texts()]
     assert REGION_LABEL in labels
     assert ELLIPSE_LABEL in labels
 

@@ -321,7 +321,7 @@ def test_output_that_cannot_be_written(folder, command, arguments, unbuffered):
 
 
 def test_a_file_that_cannot_be_finished_is_removed_and_does_not_keep_the_other(folder, monkeypatch):
-    monkeypatch.setattr('diffdrive_jacobian.plots.sweep_figure.draw', lambda *_: b'picture')
+    monkeypatch.setattr('diffdrive_jacobian.tools._output.drawn', lambda *_: b'picture')
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (64, before[1]))
     try:

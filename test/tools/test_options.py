@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import threading
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -20,11 +21,13 @@ from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Text
 from diffdrive_jacobian.drives import in_lockstep
+from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.remote_goal import send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters import file as configuration_files
 from diffdrive_jacobian.parameters.file import configurations
+from diffdrive_jacobian.plots import rendering
 from diffdrive_jacobian.recording import NothingToPlayError, Playback, replay
 from diffdrive_jacobian.recording.recording import open_recording
 from diffdrive_jacobian.testing import Lockstep
@@ -93,10 +96,12 @@ def test_a_bag_of_several_robots_is_read_by_namespace(robots, monkeypatch):
     message = refused('verify_run', robots, '--namespace', 'one', '--robot', 'create3')
     assert 'have no effect: the bag has cmd_vel_out' in message
     drawn = []
-    monkeypatch.setattr(plot_run, 'draw', lambda runs, path, **_: drawn.append((runs[0], path)))
-    assert run('plot_run', robots, '--namespace', 'two').code == 0
-    ((data, path),) = drawn
-    assert (round(data.odometry.values[0, 0]), path.name) == (5, 'two_two.png')
+    monkeypatch.setattr(plot_run, 'run_figure', drawn.append)
+    monkeypatch.setattr(rendering, 'render', lambda *_: b'picture')
+    ended = run('plot_run', robots, '--namespace', 'two')
+    assert (ended.code, Path(ended.out.splitlines()[0]).name) == (0, 'two_two.png')
+    (((data,),),) = (drawn,)
+    assert round(data.odometry.values[0, 0]) == 5
 
 
 def test_playback_chooses_a_namespace(robots):
@@ -160,14 +165,13 @@ def test_a_directory_that_is_no_bag_is_never_replaced(tmp_path, content):
         (target / name).touch()
     (tmp_path / 'link').symlink_to(target)
     for name in ('thesis', 'link'):
-        with pytest.raises(OSError, match='is not a bag: it is not replaced'):
+        with pytest.raises(UserError, match='is not a bag: it is not replaced'):
             open_recording('run', str(tmp_path / name), replace=True)
     assert sorted(one.name for one in target.iterdir()) == sorted(content)
 
 
 def test_force_replaces_bags_and_files_and_no_directories(tmp_path, robots, monkeypatch):
-    monkeypatch.setattr('diffdrive_jacobian.plots.run_figure.figure', lambda *_: None)
-    monkeypatch.setattr('diffdrive_jacobian.plots.run_figure.render', lambda *_: b'picture')
+    monkeypatch.setattr(rendering, 'render', lambda *_: b'picture')
     monkeypatch.chdir(tmp_path)
     for name in ('run.png', 'a.png', 'a.csv'):
         (tmp_path / name).write_text('old')

@@ -13,6 +13,7 @@ import pytest
 from support import commands
 from support.bags import SECOND, odom, write_bag
 from support.ros_messages import goal, joint_command, twist, twist_stamped
+from support.ros_messages import path as path_message
 from support.runs import RATE, sample
 
 from diffdrive_jacobian.bags import BagError, read_run
@@ -20,7 +21,9 @@ from diffdrive_jacobian.bags.table import COLUMNS, decimal_seconds
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.plots.output_files import create
-from diffdrive_jacobian.plots.run_figure import LABELS, draw, figure, names
+from diffdrive_jacobian.plots.run_panels import COMMAND, LABELS, fault_label
+from diffdrive_jacobian.plots.run_pictures import COLORS, names_of
+from diffdrive_jacobian.tools import _output
 
 plot = partial(commands.run, 'plot_run')
 refused = partial(commands.refused, 'plot_run')
@@ -58,8 +61,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Files are written without drawing their picture."""
-    monkeypatch.setattr(run_figure, 'figure', lambda *_: None)
-    monkeypatch.setattr(run_figure, 'render', lambda *_: b'picture')
+    monkeypatch.setattr(_output, 'drawn', lambda *_: b'picture')
 
 
 def odometry_only(path, **how):
@@ -72,10 +74,11 @@ def odometry_only(path, **how):
 
 
 def by_label(made):
-    return {one.get_ylabel(): one for one in made.axes if one.get_ylabel()}
+    """Return the panels over time by their titles."""
+    return {one.get_title(loc='left'): one for one in made.axes[1:]}
 
 
-def drawn(axes, color=run_figure.COLORS[0]):
+def drawn(axes, color=COLORS[0]):
     """Return the points of the lines of a colour, without their gaps."""
     rows = [np.column_stack(one.get_data()) for one in axes.lines if one.get_color() == color]
     rows = np.vstack([one for one in rows if len(one) > 1])
@@ -83,24 +86,27 @@ def drawn(axes, color=run_figure.COLORS[0]):
 
 
 def legends(made):
-    found = [axes.get_legend() for axes in made.axes]
-    return [text.get_text() for one in found if one for text in one.get_texts()]
+    return [text.get_text() for one in made.legends for text in one.get_texts()]
+
+
+def written(made):
+    """Return the lines of text around the axes."""
+    return [one.get_text() for one in made.texts]
 
 
 def commanded(made):
     lines = by_label(made)[LABELS['v']].lines
-    return [one for one in lines if one.get_color() == run_figure.COMMAND]
+    return [one for one in lines if one.get_color() == COMMAND]
 
 
 def test_the_axes_show_the_run_with_units(run):
-    made = figure([run])
+    made = run_figure(run)
     plane, axes = made.axes[0], by_label(made)
     assert plane.get_aspect() == 1.0
     assert (plane.get_xlabel(), plane.get_ylabel()) == ('x [m]', 'y [m]')
     of_paths = {LABELS[name] for name in ('across', 'along', 'path_heading_error', 'late')}
-    assert set(axes) == {'y [m]', *LABELS.values()} - of_paths
-    assert 'limit' in legends(made)
-    assert {one.get_xlabel() for one in axes.values()} == {'x [m]', 'time [s]', ''}
+    assert set(axes) == {*LABELS.values()} - of_paths
+    assert {one.get_xlabel() for one in axes.values()} == {'time since the first goal [s]', ''}
     assert drawn(plane)[: len(run.odometry)] == pytest.approx(run.odometry.values[:, :2], abs=0.0)
     one = timeline(run)
     shown = {
@@ -110,68 +116,183 @@ def test_the_axes_show_the_run_with_units(run):
         'distance': one.distance,
         'bearing_error': one.bearing_error,
     }
+    # The goal came half a second after the first odometry.
     for quantity, values in shown.items():
-        expected = np.column_stack([np.arange(200) / RATE, values])[~np.isnan(values)]
+        expected = np.column_stack([np.arange(200) / RATE - 0.5, values])[~np.isnan(values)]
         assert drawn(axes[LABELS[quantity]]) == pytest.approx(expected, abs=1e-9)
     (line,) = commanded(made)
     assert line.get_drawstyle() == 'steps-post'
-    values = [[0.5, 0.5], [2.0, 0.25], [199 / RATE, 0.25]]
+    values = [[0.0, 0.5], [1.5, 0.25], [199 / RATE - 0.5, 0.25]]
     assert np.column_stack(line.get_data()) == pytest.approx(np.array(values), abs=1e-9)
+    assert written(made)[0] == 'bag: not arrived within 3.5 s, 1.99 m'
+
+
+def test_limits_are_drawn_where_they_are_near(run):
+    def bounds(parameters):
+        made = run_figure(replace(run, parameters={'/virtual_robot': parameters}))
+        lines = by_label(made)[LABELS['v']].lines
+        found = {one.get_ydata()[0] for one in lines if one.get_color() == 'black'}
+        assert ('limit' in legends(made)) == bool(found)
+        return found
+
+    # It drives with 0.5 m/s.
+    assert bounds({'linear.x.max_velocity': 0.22, 'linear.x.min_velocity': -0.1}) == {0.22}
+    assert bounds({'linear.x.max_velocity': 0.7}) == {0.7}
+    assert bounds({'linear.x.max_velocity': 0.8}) == set()
 
 
 def test_runs_differ_by_colour_and_by_style_and_have_no_commands(run):
-    made = figure([replace(run, path=Path(name)) for name in 'abc'])
-    labelled = [one for one in made.axes[0].lines if not one.get_label().startswith('_')]
-    assert [one.get_label()[:2] for one in labelled] == ['a:', 'b:', 'c:']
-    assert len({one.get_color() for one in labelled}) == 3
-    assert len({one.get_linestyle() for one in labelled}) == 3
-    # One for each run, zero, and two limits for each.
-    assert len(by_label(made)[LABELS['v']].lines) == 3 + 3 + 2 * 3
+    made = run_figure([replace(run, path=Path(name)) for name in 'abc'])
+    assert [one[:3] for one in written(made) if 'not arrived' in one] == ['a: ', 'b: ', 'c: ']
+    # The samples beside the names.
+    assert len({one.get_color() for one in made.artists}) == 3
+    assert len({one.get_linestyle() for one in made.artists}) == 3
+    # One for each run, zero, and the limit that is near, for each.
+    assert len(by_label(made)[LABELS['v']].lines) == 3 + 3 + 3
     assert commanded(made) == []
+
+
+def test_gains_that_differ_stand_beside_the_runs_and_the_others_in_the_title(run):
+    def driven(name, kp, controller='go_to_goal'):
+        values = {'controller': controller, 'kp': kp, 'kv': 0.5}
+        return replace(run, path=Path(name), parameters={'/go_to_goal': values})
+
+    title, a, b = written(run_figure([driven('a', 1.0), driven('b', 2.0)]))
+    assert title == 'control law go_to_goal: kv = 0.5 1/s'
+    assert [a.rpartition('; ')[2], b.rpartition('; ')[2]] == ['kp = 1 1/s', 'kp = 2 1/s']
+    _, title = written(run_figure(driven('a', 1.0)))
+    assert title == 'control law go_to_goal: kp = 1 1/s, kv = 0.5 1/s'
+    a, b = written(run_figure([driven('a', 1.0), driven('b', 1.0, 'pose')]))
+    assert a.endswith('; go_to_goal: kp = 1 1/s, kv = 0.5 1/s')
+    assert b.endswith('; pose: kp = 1 1/s, kv = 0.5 1/s')
+
+
+def test_waiting_before_the_goal_is_cut_off_and_driving_before_it_is_not(tmp_path):
+    def window(name, v):
+        times = [(0.1 * k, 10.0 + 0.1 * k) for k in range(60)]
+        sent = [(at, '/odom', odom(v * t, 0.0, 0.0, seconds=at)) for t, at in times]
+        read = read_run(write_bag(tmp_path / name, [*sent, (14.0, '/goal_pose', goal(2.0, 0.0))]))
+        return by_label(run_figure(read))[LABELS['v']].get_xlim()
+
+    low, high = window('waits', 0.0)
+    assert -0.1 < low <= 0.0
+    assert 1.9 < high < 2.0
+    assert window('drives', 0.2)[0] == pytest.approx(-4.0, abs=0.2)
+
+
+def test_the_robot_is_drawn_to_scale_where_its_size_is_known(run, tmp_path):
+    sized = {'/virtual_robot': {'wheel_radius': 0.03, 'wheel_separation': 0.2}}
+    plane = run_figure(replace(run, parameters=sized)).axes[0]
+    bodies = [one.get_xy() for one in plane.patches if len(one.get_xy()) == 7]
+    # From the left to the right wheel, at the start and at the end.
+    ends = run.odometry.values[[0, -1], :3]
+    for body, (x, y, theta) in zip(bodies, ends, strict=True):
+        lateral = (body - [x, y]) @ [-np.sin(theta), np.cos(theta)]
+        assert np.ptp(lateral) == pytest.approx(0.84 * 0.2)
+    assert 'robot at the end' in legends(run_figure(replace(run, parameters=sized)))
+    # It would be a dot, or its size is not known.
+    for parameters in ({'/virtual_robot': {'wheel_radius': 1e-3, 'wheel_separation': 2e-3}}, {}):
+        made = run_figure(replace(run, parameters=parameters))
+        assert not made.axes[0].patches
+        assert 'end' in legends(made)
 
 
 def test_without_goals_wheels_and_limits_these_are_left_out(tmp_path):
     plain = read_run(odometry_only(tmp_path / 'bag'))
     # More runs than there are styles.
-    made = figure([replace(plain, path=Path(f'run_{index}')) for index in range(7)])
-    assert set(by_label(made)) == {'y [m]', LABELS['v'], LABELS['omega']}
-    assert 'limit' not in legends(made)
+    made = run_figure([replace(plain, path=Path(f'run_{index}')) for index in range(7)])
+    assert set(by_label(made)) == {LABELS['v'], LABELS['omega']}
+    assert legends(made) == ['start', 'end']
+    assert by_label(made)[LABELS['omega']].get_xlabel() == 'time [s]'
 
 
 def test_no_line_leads_to_where_the_odometry_is_reset_and_one_pose_is_drawn(tmp_path):
     sent = [(1.0 + k, '/odom', odom(5 * (k > 2), 0.01 * k, 0, seconds=1.0 + k)) for k in range(6)]
-    made = figure([read_run(write_bag(tmp_path / 'bag', sent))])
-    (path,) = (one for one in made.axes[0].lines if not one.get_label().startswith('_'))
+    made = run_figure(read_run(write_bag(tmp_path / 'bag', sent)))
+    path = made.axes[0].lines[0]
     assert np.flatnonzero(np.isnan(path.get_xdata())).tolist() == [3]
-    low, high = figure([read_run(write_bag(tmp_path / 'one', sent[:1]))]).axes[0].get_xlim()
+    low, high = run_figure(read_run(write_bag(tmp_path / 'one', sent[:1]))).axes[0].get_xlim()
     assert 0.4 < high - low < 5.0
 
 
-def test_everything_drawn_lies_inside_the_picture_whatever_the_users_style(run):
+def overlapping(made):
+    """Return pairs of texts, and of texts and axes, that overlap or are not in the picture."""
+    made.draw_without_rendering()
+    page, found = made.bbox, []
+    boxes = [('legend', one.get_window_extent()) for one in made.legends]
+    boxes += [(one.get_text(), one.get_window_extent()) for one in made.texts]
+    for axes in made.axes:
+        boxes.append((axes.get_label(), axes.get_window_extent()))
+        labels = [axes.xaxis.label, axes.yaxis.label, axes.title, axes._left_title, axes._right_title]
+        for one in [*labels, *axes.get_xticklabels(), *axes.get_yticklabels()]:
+            inside = axes.get_xlim() if one in axes.get_xticklabels() else axes.get_ylim()
+            tick = one in axes.get_xticklabels() or one in axes.get_yticklabels()
+            at = one.get_position()[one in axes.get_yticklabels()]
+            if one.get_text() and one.get_visible() and (not tick or inside[0] <= at <= inside[1]):
+                boxes.append((one.get_text(), one.get_window_extent()))
+        boxes += [(one.get_text(), one.get_window_extent()) for one in axes.texts]
+    for index, (name, box) in enumerate(boxes):
+        if not (page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1):
+            found.append((name, 'outside'))
+        for other, another in boxes[index + 1 :]:
+            # A label of a goal is in the plane; axes have half a pixel.
+            if 'goal' in name[:4] or 'goal' in other[:4]:
+                continue
+            if (
+                box.overlaps(another)
+                and min(
+                    box.x1 - another.x0, another.x1 - box.x0, box.y1 - another.y0, another.y1 - box.y0
+                )
+                > 1.0
+            ):
+                found.append((name, other))
+    return found
+
+
+@pytest.mark.parametrize('shape', [(1.0, 0.0), (1.0, 0.3), (1.0, 0.9), (0.5, 1.0), (0.0, 1.0)])
+@pytest.mark.parametrize('runs', [1, 2, 7, 12])
+def test_nothing_overlaps_with_up_to_nine_panels_whatever_the_names(tmp_path, shape, runs):
+    """With goals, a trajectory that waits, wheels, long names and notes."""
+    x, y = shape
+    wrong = [(10.1, '/joint_command', joint_command(1e308, 0))] * 3
+    places = [(x * k / 4, y * k / 4, 0.0) for k in range(5)]
+    planned = path_message(*places, times=[0.0, 0.1, 0.2, 0.3, 0.4])
+    sent = [*sample(wrong), (10.5, '/goal_pose', goal(x, y)), (11.0, '/path', planned)]
+    for _, topic, one in sent:
+        if topic == '/odom':
+            one.pose.pose.position.x *= x
+            one.pose.pose.position.y = y * one.header.stamp.nanosec / 1e9
+    read = read_run(write_bag(tmp_path / 'bag', sent))
+    made = run_figure([replace(read, path=Path(f'{number}_{60 * "x"}')) for number in range(runs)])
+    assert len(by_label(made)) >= 8
+    assert overlapping(made) == []
+
+
+def test_labels_of_goals_are_apart(tmp_path):
+    """Also of goals at nearly the same place."""
+    sent = sample([(10.1 + 0.1 * k, '/goal_pose', goal(1.0 + 0.01 * k, 0.5)) for k in range(12)])
+    made = run_figure(read_run(write_bag(tmp_path / 'bag', sent)))
+    made.draw_without_rendering()
+    boxes = [one.get_window_extent() for one in made.axes[0].texts]
+    assert len(boxes) > 4
+    assert not any(a.overlaps(b) for index, a in enumerate(boxes) for b in boxes[index + 1 :])
+
+
+def test_the_users_style_is_of_no_effect(run):
     import matplotlib
 
     with matplotlib.rc_context({'figure.figsize': (1, 1), 'text.usetex': True}):
-        made = figure([run, replace(run, path=Path('second'))])
+        made = run_figure([run, replace(run, path=Path('second'))])
         assert matplotlib.rcParams['text.usetex'] is True
-    made.draw_without_rendering()
-    assert made.get_size_inches().tolist() == [11.0, 7.0]
-    width, height = made.get_size_inches() * made.dpi
-    boxes = [axes.get_tightbbox() for axes in made.axes]
-    assert min(min(box.x0, box.y0) for box in boxes) >= 0.0
-    assert max(box.x1 for box in boxes) <= width
-    assert max(box.y1 for box in boxes) <= height
+    assert made.get_size_inches()[0] == 11.0
+    assert overlapping(made) == []
 
 
-@pytest.mark.parametrize('runs', [1, 2, 7, 12])
-def test_long_names_leave_the_path_its_room(run, runs):
-    made = figure([replace(run, path=Path(f'{number}_{60 * "x"}')) for number in range(runs)])
-    made.draw_without_rendering()
-    width, height = made.get_size_inches() * made.dpi
-    plane = made.axes[0]
-    assert plane.get_window_extent().width > 0.3 * width
-    names = plane.get_legend().get_window_extent()
-    assert 0.0 <= names.x0 < names.x1 <= width
-    assert plane.get_window_extent().y1 < names.y0 < names.y1 <= height
+def test_numbers_of_faults_have_two_decimals():
+    fault = "Loss('odom', probability=0.8151234, burst=3, start=12.00412, duration=0.000123456)"
+    found = fault_label(fault)
+    assert found.startswith("Loss('odom', probability=0.82, burst=3, start=12.00, durati")
+    assert len(found) == 60
 
 
 @pytest.mark.usefixtures('undrawn')
@@ -179,14 +300,34 @@ def test_messages_that_were_skipped_are_reported_in_picture_and_terminal(run, tm
     wrong = [(10.1, '/joint_command', joint_command(1e308, 0))] * 3
     bag = write_bag(tmp_path / 'bag', sample(wrong, count=9))
     note = '3 of 3 messages on /joint_command hold invalid or implausible values and were skipped'
-    assert plot(bag) == (0, f'{tmp_path / "bag.png"}\n', f'plot_run: {bag}: {note}\n')
+    ended = plot(bag)
+    assert (ended.code, ended.err) == (0, f'plot_run: {bag}: {note}\n')
     noted = read_run(bag)
-    assert figure([noted]).get_supxlabel() == note
+    assert written(run_figure(noted))[-1] == note
     # Notes of several runs name them, and are not too many.
-    several = figure([replace(noted, path=Path(f'r{index}$')) for index in range(5)])
-    lines = several.get_supxlabel().splitlines()
+    several = run_figure([replace(noted, path=Path(f'r{index}$')) for index in range(5)])
+    lines = written(several)[-4:]
     assert [one[:5] for one in lines[:3]] == [r'r0\$:', r'r1\$:', r'r2\$:']
     assert lines[3:] == ['and 2 more notes']
+
+
+# --- What is printed
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_a_table_compares_the_runs(bag, folder):
+    other = odometry_only(folder / 'other', v=0.25)
+    header, first, second = plot(bag, other).out.splitlines()[1:]
+    assert header.split('  ')[0] == 'run'
+    columns = [one.strip() for one in header.split('  ') if one.strip()]
+    assert columns == [
+        *('run', 'outcome', 'time', 'length', 'to the goal', 'max bearing error', 'max v', 'max omega')
+    ]
+    assert first.split('  ')[-1].strip() == '0.50 rad/s'
+    assert ('not arrived' in first, 'no goal' in second) == (True, True)
+    assert ('3.5 s' in first, '1.99 m' in first, '0.50 m/s' in first) == (True, True, True)
+    # A column ends at the same place in each line.
+    assert second.index('0.25 m/s') == first.index('0.50 m/s') == header.index('max v') - 3
 
 
 # --- CSV
@@ -251,7 +392,8 @@ def test_the_picture_is_beside_a_bag_of_any_name(folder, monkeypatch):
     name = '_$x^$ 走行' + 'a' * 200
     monkeypatch.chdir(odometry_only(folder / name))
     picture = folder / f'{name}.png'
-    assert plot('.') == (0, f'{picture}\n', '')
+    ended = plot('.')
+    assert (ended.code, ended.out.splitlines()[0], ended.err) == (0, str(picture), '')
     assert picture.read_bytes().startswith(b'\x89PNG')
 
 
@@ -264,8 +406,8 @@ def test_several_runs_get_one_picture_and_a_table_each(folder):
         speeds = {one.name: read_csv(one)['v_mps'][0] for one in (folder / 'numbers').iterdir()}
         assert speeds == {'x_bag.csv': 0.2, 'y_bag.csv': 0.5}
         assert (folder / 'x' / 'bag_and_bag.png').exists()
-    assert names([Path('/a/run'), Path('/b/walk')]) == ['run', 'walk']
-    assert names([Path('/a/x/run'), Path('/b/x/run')]) == ['a/x/run', 'b/x/run']
+    assert names_of([Path('/a/run'), Path('/b/walk')]) == ['run', 'walk']
+    assert names_of([Path('/a/x/run'), Path('/b/x/run')]) == ['a/x/run', 'b/x/run']
 
 
 @pytest.mark.usefixtures('undrawn')
@@ -317,16 +459,13 @@ def test_a_bag_without_odometry_is_refused(tmp_path):
     assert 'no odometry' in message
     assert list(tmp_path.iterdir()) == [bag]
     with pytest.raises(BagError):
-        draw([read_run(bag)], tmp_path / 'a.png')
+        run_figure(read_run(bag))
 
 
-def test_files_are_checked_also_when_they_are_written(run, tmp_path):
-    with pytest.raises(ValueError, match=r'must end in \.png, \.svg, \.pdf'):
-        draw([run], tmp_path / 'a.gif')
+def test_files_are_checked_also_when_they_are_written(tmp_path):
     (tmp_path / 'a.png').touch()
-    for write in (lambda path: draw([run], path), lambda path: create(path, b'x')):
-        with pytest.raises(FileExistsError):
-            write(tmp_path / 'a.png')
+    with pytest.raises(FileExistsError):
+        create(tmp_path / 'a.png', b'x')
 
 
 @pytest.mark.usefixtures('undrawn')
@@ -335,7 +474,7 @@ def test_paths_are_printed_without_control_characters(bag, tmp_path):
     place.mkdir()
     escaped = rf'{tmp_path}/\x1b]0;x\x07 \udcff'
     ended = plot(bag, '-o', place / 'a.png', '--csv', place / 'a.csv')
-    assert ended == (0, f'{escaped}/a.png\n{escaped}/a.csv\n', '')
+    assert ended.out.splitlines()[:2] == [f'{escaped}/a.png', f'{escaped}/a.csv']
     assert f'{escaped}/a.png exists already' in refused(bag, '-o', place / 'a.png')
     missing = place / 'none' / 'a.png'
     assert f'{escaped}/none/a.png cannot be written: ' in refused(bag, '-o', missing, code=1)

@@ -21,9 +21,10 @@ from diffdrive_jacobian.control import (
     find_controller,
     go_to_pose,
 )
+from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.plots import output_files, sweep_figure
-from diffdrive_jacobian.plots.sweep_figure import TITLES, figure
+from diffdrive_jacobian.plots.sweep_pictures import CONTOUR_GRID, TITLES
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import (
     RobotModel,
@@ -59,7 +60,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Nothing is drawn, which takes a while."""
-    monkeypatch.setattr(sweep_figure, 'draw', lambda *_: b'picture')
+    monkeypatch.setattr(_output, 'drawn', lambda *_: b'picture')
 
 
 def left(folder):
@@ -255,7 +256,7 @@ def test_options_are_what_is_swept(monkeypatch):
 
     def catch(setup, progress):
         asked.append(setup)
-        raise ValueError
+        raise UserError('asked')
 
     monkeypatch.setattr(sweep_gains, 'sweep', catch)
     for options, changes in OPTIONS.items():
@@ -285,7 +286,7 @@ def legend(made):
 def test_maps_show_the_means_with_units():
     swept = sweep(replace(SMALL, duration=5.8))
     assert ((swept.arrived > 0) & ~swept.complete).any()
-    made = figure(swept)
+    made = sweep_figure(swept)
     assert set(maps(made)) == set(MEASURES)
     for measure, panel in maps(made).items():
         assert panel.get_title() == TITLES[measure]
@@ -310,7 +311,7 @@ def test_maps_show_the_means_with_units():
 
 @pytest.mark.parametrize('controller', ['go_to_goal', 'pose'])
 def test_the_boundary_is_drawn_in_every_map(controller):
-    made = figure(small()._replace(setup=replace(SMALL, controller=controller)))
+    made = sweep_figure(small()._replace(setup=replace(SMALL, controller=controller)))
     boundary = find_controller(controller).boundary
     factor, name, what = boundary.ratio, boundary.equation, boundary.beyond
     assert name == {1.0: 'kp = kv', 2.0: 'kp = 2 kv'}[factor]
@@ -325,13 +326,13 @@ def test_the_boundary_is_drawn_in_every_map(controller):
 
 def test_a_fine_grid_has_lines_of_equal_values_and_only_what_lies_in_it_is_marked():
     gains = {'kp': (5.0, 6.0), 'kv': (0.5, 0.6)}
-    coarse = figure(sweep(replace(SMALL, gains=gains, grid=2)))
+    coarse = sweep_figure(sweep(replace(SMALL, gains=gains, grid=2)))
     (only,) = legend(coarse)
     assert only.startswith('fastest: kp 6, kv 0.6, ')
     assert not any(panel.texts for panel in maps(coarse).values())
     # Nothing arrives so soon.
-    assert 'fastest' not in ' '.join(legend(figure(sweep(replace(SMALL, grid=2, duration=0.01)))))
-    fine = figure(sweep(replace(SMALL, grid=sweep_figure.CONTOUR_GRID, starts=1)))
+    assert 'fastest' not in ' '.join(legend(sweep_figure(sweep(replace(SMALL, grid=2, duration=0.01)))))
+    fine = sweep_figure(sweep(replace(SMALL, grid=CONTOUR_GRID, starts=1)))
     for lined, plain in zip(maps(fine).values(), maps(coarse).values(), strict=True):
         assert len(lined.collections) > len(plain.collections)
 
@@ -344,7 +345,7 @@ def test_everything_drawn_lies_inside_the_picture_whatever_the_users_style():
     robot = RobotModel(limits=replace(LIMITS, min_v=-0.1))
     setup = replace(SMALL, grid=2, starts=1, controller='pose', gains=gains, robot=robot)
     with matplotlib.rc_context({'figure.figsize': (1, 1), 'text.usetex': True, 'image.cmap': 'jet'}):
-        made = figure(sweep(setup))
+        made = sweep_figure(sweep(setup))
     made.get_layout_engine().execute(made)
     width, height = made.get_size_inches() * made.dpi
     above = made._suptitle.get_window_extent()
@@ -367,7 +368,7 @@ def test_a_signal_during_the_batch_or_the_drawing_ends_it(folder, monkeypatch):
         signals.count = 1
         return b'picture'
 
-    monkeypatch.setattr(sweep_figure, 'draw', signal)
+    monkeypatch.setattr(_output, 'drawn', signal)
     assert run(*QUICK, signals=signals) == interrupted
     signals.count = 0
     monkeypatch.setattr(_output.Bar, 'show', signal)

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diffdrive_jacobian.control.controller import KP, KV, Boundary, Gain
-from diffdrive_jacobian.plots.rendering import render, styled
+from diffdrive_jacobian.plots.rendering import picture
 from diffdrive_jacobian.time_units import NANOSECONDS
-
-__all__ = ['draw', 'figure']
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,17 +38,8 @@ LINE, LIT, EMPTY = 'black', 'white', '#dcdcdc'
 DASHES = (0, (5, 2))
 
 
-def draw(swept: Sweep, ending: str) -> bytes:
-    """Draw a sweep and return the content of a `png`, `svg` or `pdf` file.
-
-    Raises:
-        ModuleNotFoundError: matplotlib is not installed.
-    """
-    with styled():
-        return render(figure(swept), ending)
-
-
-def figure(swept: Sweep) -> Figure:
+@picture
+def sweep_figure(swept: Sweep) -> Figure:
     """Return a sweep as a figure. Its axes are the heat maps, then the legend, then the scales.
 
     Raises:
@@ -58,23 +47,22 @@ def figure(swept: Sweep) -> Figure:
     """
     from matplotlib.figure import Figure
 
-    with styled():
-        drawn = Figure(figsize=SIZE, layout='constrained')
-        grid = drawn.add_gridspec(2, len(TITLES), height_ratios=[1.0, 0.02])
-        panels = [drawn.add_subplot(grid[0, column]) for column in range(len(TITLES))]
-        below = drawn.add_subplot(grid[1, :])
-        for panel, (measure, title) in zip(panels, TITLES.items(), strict=True):
-            _draw_map(drawn, panel, swept, measure)
-            _draw_boundary(panel, swept.setup)
-            for mark in _marks(swept):
-                mark.set_clip_on(False)
-                panel.add_line(mark)
-            panel.set_title(title, pad=10.0)
-            panel.set_xlabel(_label(swept.setup.axes[0]))
-        panels[0].set_ylabel(_label(swept.setup.axes[1]))
-        below.axis('off')
-        below.legend(handles=_legend(swept), loc='center', ncol=4, borderaxespad=0.0)
-        drawn.suptitle(describe(swept.setup))
+    drawn = Figure(figsize=SIZE, layout='constrained')
+    grid = drawn.add_gridspec(2, len(TITLES), height_ratios=[1.0, 0.02])
+    panels = [drawn.add_subplot(grid[0, column]) for column in range(len(TITLES))]
+    below = drawn.add_subplot(grid[1, :])
+    for panel, (measure, title) in zip(panels, TITLES.items(), strict=True):
+        _draw_map(drawn, panel, swept, measure)
+        _draw_boundary(panel, swept.setup)
+        for mark in _marks(swept):
+            mark.set_clip_on(False)
+            panel.add_line(mark)
+        panel.set_title(title, pad=10.0)
+        panel.set_xlabel(_label(swept.setup.axes[0]))
+    panels[0].set_ylabel(_label(swept.setup.axes[1]))
+    below.axis('off')
+    below.legend(handles=_legend(swept), loc='center', ncol=4, borderaxespad=0.0)
+    drawn.suptitle(describe(swept.setup))
     return drawn
 
 

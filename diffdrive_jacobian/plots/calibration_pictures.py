@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diffdrive_jacobian.calibration.description import Track, compared_distance, rms, tracks
 from diffdrive_jacobian.calibration.result import Calibration
-from diffdrive_jacobian.plots.rendering import render, styled
+from diffdrive_jacobian.plots.rendering import picture
 from diffdrive_jacobian.plots.run_lines import line
 
 if TYPE_CHECKING:
@@ -27,18 +26,8 @@ MOST_TRACKS = 12
 _NO_BREAKS = np.array([], dtype=np.intp)
 
 
-def draw(result: Calibration, ending: str) -> bytes:
-    """Draw a calibration and return the content of a `png`, `svg` or `pdf` file.
-
-    Raises:
-        ModuleNotFoundError: matplotlib is not installed.
-    """
-    with warnings.catch_warnings(), styled():
-        warnings.filterwarnings('ignore', message='Glyph')
-        return render(figure(result), ending)
-
-
-def figure(result: Calibration) -> Figure:
+@picture
+def calibration_figure(result: Calibration) -> Figure:
     """Return a calibration as a figure. Its axes are the plane, then the errors over time.
 
     Raises:
@@ -50,26 +39,25 @@ def figure(result: Calibration) -> Figure:
     before, after = (
         tracks(result, geometry, distance) for geometry in (result.nominal, result.geometry)
     )
-    with styled():
-        drawing = Figure(figsize=SIZE, layout='constrained')
-        grid = drawing.add_gridspec(3, 2, width_ratios=[1.2, 1.0])
-        plane = drawing.add_subplot(grid[:, 0])
-        _draw_plane(plane, before, after)
-        panels = [drawing.add_subplot(grid[0, 1])]
-        panels += [drawing.add_subplot(grid[row, 1], sharex=panels[0]) for row in (1, 2)]
-        for panel, name, unit in zip(panels, ('position', 'heading'), ('m', 'rad'), strict=False):
-            for drawn, label, color in ((before, 'before', BEFORE), (after, 'after', AFTER)):
-                values = [getattr(one, f'{name}_error') for one in drawn]
-                rows = _over_time(drawn, values)
-                panel.plot(*rows.T, color=color, lw=1.3, label=f'{label}: rms {rms(values):.3g} {unit}')
-            panel.set(ylabel=f'{name} error\nafter {distance:.2g} m [{unit}]')
-            panel.legend(loc='upper left', ncol=2, fontsize=8.5, bbox_to_anchor=(0.0, 1.25))
-        _draw_residuals(panels[2], result)
-        panels[2].set(xlabel='time [s]')
-        names = ('left radius', 'right radius', 'separation')
-        found = zip(names, result.multipliers, np.sqrt(np.diag(result.covariance)), strict=True)
-        multipliers = ', '.join(f'{name} {one:.5f} ± {std:.5f}' for name, one, std in found)
-        drawing.suptitle(f'multipliers: {multipliers}', fontsize=9.5)
+    drawing = Figure(figsize=SIZE, layout='constrained')
+    grid = drawing.add_gridspec(3, 2, width_ratios=[1.2, 1.0])
+    plane = drawing.add_subplot(grid[:, 0])
+    _draw_plane(plane, before, after)
+    panels = [drawing.add_subplot(grid[0, 1])]
+    panels += [drawing.add_subplot(grid[row, 1], sharex=panels[0]) for row in (1, 2)]
+    for panel, name, unit in zip(panels, ('position', 'heading'), ('m', 'rad'), strict=False):
+        for drawn, label, color in ((before, 'before', BEFORE), (after, 'after', AFTER)):
+            values = [getattr(one, f'{name}_error') for one in drawn]
+            rows = _over_time(drawn, values)
+            panel.plot(*rows.T, color=color, lw=1.3, label=f'{label}: rms {rms(values):.3g} {unit}')
+        panel.set(ylabel=f'{name} error\nafter {distance:.2g} m [{unit}]')
+        panel.legend(loc='upper left', ncol=2, fontsize=8.5, bbox_to_anchor=(0.0, 1.25))
+    _draw_residuals(panels[2], result)
+    panels[2].set(xlabel='time [s]')
+    names = ('left radius', 'right radius', 'separation')
+    found = zip(names, result.multipliers, np.sqrt(np.diag(result.covariance)), strict=True)
+    multipliers = ', '.join(f'{name} {one:.5f} ± {std:.5f}' for name, one, std in found)
+    drawing.suptitle(f'multipliers: {multipliers}', fontsize=9.5)
     return drawing
 
 
