@@ -67,6 +67,8 @@ class Timeline:
     (m); NaN: no trajectory."""
     late: Array
     """How long the times of a trajectory have waited so far (s); NaN: no trajectory."""
+    elapsed: Array
+    """Time of the trajectory (s); NaN: no trajectory."""
     across: Array
     """Distance from the path, positive to its left (m); NaN: none."""
     path_heading_error: Array
@@ -133,6 +135,7 @@ def timeline(run: Run) -> Timeline:
         across=errors[2],
         path_heading_error=errors[3],
         late=errors[4],
+        elapsed=errors[5],
     )
 
 
@@ -268,9 +271,9 @@ def _progress(
 def _along_paths(
     run: Run, routes: list[Followed], driven: Indices
 ) -> tuple[tuple[Path, ...], Indices, Array]:
-    """Return the paths, which is driven along, and progress, errors and lateness, shape (5, n)."""
+    """Return the paths, which is driven along, and progress, errors and times, shape (6, n)."""
     paths: list[Path] = []
-    which, errors = np.full(len(driven), -1), np.full((5, len(driven)), np.nan)
+    which, errors = np.full(len(driven), -1), np.full((6, len(driven)), np.nan)
     poses, stamps = run.odometry.values[:, :3], run.odometry.stamps
     approach = run.number_of_node(
         'go_to_goal', 'path_approach_distance', GoToGoalParameters().path_approach_distance
@@ -292,22 +295,13 @@ def _along_paths(
         errors[0, here], errors[2, here], errors[3, here] = s, placed.across, placed.heading
         if path.times is not None:
             dt = np.clip(np.diff(stamps[here], prepend=stamps[here][:1]) / NANOSECONDS, 0.0, None)
-            elapsed = _times_of_node(path, poses[here], dt, approach)
-            errors[1, here] = s - np.array([path.at_time(time).s for time in elapsed.tolist()])
-            errors[4, here] = np.cumsum(dt) - np.minimum(elapsed, path.duration)
+            elapsed = [0.0]
+            for pose, step in zip(poses[here].tolist(), dt.tolist(), strict=True):
+                elapsed.append(path.time_after(elapsed[-1], pose, step, approach))
+            errors[1, here] = s - np.array([path.at_time(time).s for time in elapsed[1:]])
+            errors[4, here] = np.cumsum(dt) - np.minimum(elapsed[1:], path.duration)
+            errors[5, here] = elapsed[1:]
     return tuple(paths), which, errors
-
-
-def _times_of_node(path: Path, poses: Array, dt: Array, approach: float) -> Array:
-    """Return the time of a trajectory as go_to_goal has it, shape (n,) (s)."""
-    elapsed, result = 0.0, np.empty(len(poses))
-    for index, (x, y, theta) in enumerate(poses.tolist()):
-        reference = path.at_time(elapsed)
-        turned = abs(wrap(reference.theta - theta)) > np.pi / 2.0
-        if not turned and np.hypot(reference.x - x, reference.y - y) <= approach:
-            elapsed += float(dt[index])
-        result[index] = elapsed
-    return result
 
 
 def _distances(run: Run, places: Array, target: int) -> Array:

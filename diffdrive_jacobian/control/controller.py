@@ -74,7 +74,7 @@ class Gain(Checked):
     above: Finite | None = None
     """Lower bound that is itself not allowed, besides `bounds`."""
     label: str = ''
-    """Label on the page; default: the name."""
+    """Label on the page, where `_x` and `_{xyz}` are subscripts; default: the name."""
     usual: tuple[float, ...] = ()
     """First and last value of the slider and of sweeps; default: a tenth and three times the default."""
 
@@ -122,7 +122,7 @@ KP = Gain(
     description='Gain on the heading error; should be larger than kv',
     bounds=(0.0, LARGEST_GAIN),
     above=0.0,
-    label='Kp',
+    label='K_p',
     usual=(0.2, 6.0),
 )
 KV = Gain(
@@ -131,7 +131,7 @@ KV = Gain(
     description='Gain on the distance',
     bounds=(0.0, LARGEST_GAIN),
     above=0.0,
-    label='Kv',
+    label='K_v',
     usual=(0.1, 3.0),
 )
 OFFSET = Gain(

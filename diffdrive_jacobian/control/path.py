@@ -18,7 +18,7 @@ Source: Bolton 1975, "Biarc curves"; Fritsch and Carlson 1980 for the times.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import cos, floor, hypot, nan, sin
+from math import cos, floor, hypot, inf, nan, pi, sin
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -173,6 +173,17 @@ class Path:
             return self._reference(0.0 if t < 0.0 else self.length, 0.0, 0.0)
         return self._reference(*_interpolated(self.times, self.arc_lengths, t))
 
+    def time_after(self, t: float, pose: Any, dt: float, approach: float) -> float:
+        """Return the time of a trajectory (s) after a step from the time t, as go_to_goal has it.
+
+        It waits while the robot at `pose` is farther than `approach` (m) from where it should be, or
+        turned away from it. `dt` is the length of the step (s).
+        """
+        x, y, theta = pose
+        there = self.at_time(t)
+        turned = abs(wrap(there.theta - theta)) > pi / 2.0
+        return t if turned or hypot(there.x - x, there.y - y) > approach else t + dt
+
     def poses_at(self, s: ArrayLike) -> Floats:
         """Return the poses of the path, with the direction of the tangent, at arc lengths as in `at`.
 
@@ -292,13 +303,33 @@ class PathProgress:
     """Heading of the robot minus that of the path there (rad)."""
     greatest: float = nan
     """Greatest absolute distance so far (m); NaN: no pose was taken."""
+    elapsed: float = 0.0
+    """Time of a trajectory, which waits for the robot (s)."""
+    seconds: float = 0.0
+    """Time since the robot began (s)."""
 
-    def moved(self, pose: Any) -> None:
-        """Take a pose of the robot, `[x, y, theta]` (m, m, rad)."""
+    def moved(self, pose: Any, dt: float = 0.0, approach: float = inf) -> None:
+        """Take a pose of the robot, `[x, y, theta]` (m, m, rad), and the time since the one before.
+
+        `dt` and `approach`, for a trajectory, are those of `Path.time_after`.
+        """
         self.s = self.path.nearest(pose[0], pose[1], self.s)
+        if self.path.times is not None:
+            self.seconds += dt
+            self.elapsed = self.path.time_after(self.elapsed, pose, dt, approach)
         errors = Path.errors(pose, self.path.at(self.s, 0.0))
         self.across, self.heading = float(errors.across), float(errors.heading)
         self.greatest = float(np.fmax(self.greatest, abs(self.across)))
+
+    @property
+    def along(self) -> float:
+        """How far the robot is ahead of its trajectory, along it (m); NaN: there are no times."""
+        return nan if self.path.times is None else self.s - self.path.at_time(self.elapsed).s
+
+    @property
+    def late(self) -> float:
+        """How long the times have waited so far (s); NaN: there are none."""
+        return nan if self.path.times is None else self.seconds - min(self.elapsed, self.path.duration)
 
     @property
     def remaining(self) -> float:

@@ -28,9 +28,15 @@ from diffdrive_jacobian.numerics.elementary import cos, hypot, maximum, sin, whe
 from diffdrive_jacobian.numerics.formula import Number, Vector, formula
 
 
-def _gain(name: str, default: float, unit: str, description: str) -> Gain:
-    bounds = (0.0, LARGEST_GAIN)
-    return Gain(name=name, default=default, unit=unit, description=description, bounds=bounds)
+def _gain(name: str, label: str, default: float, unit: str, description: str) -> Gain:
+    return Gain(
+        name=name,
+        default=default,
+        unit=unit,
+        description=description,
+        bounds=(0.0, LARGEST_GAIN),
+        label=label,
+    )
 
 
 # --- Pure pursuit
@@ -58,7 +64,7 @@ LOOKAHEAD = Gain(
     unit='m',
     description='Distance from the robot of the point of the path that pure_pursuit drives to',
     bounds=(1e-3, 100.0),
-    label='Look-ahead distance',
+    label='Look-ahead l_d',
     usual=(0.05, 1.0),
 )
 PURE_PURSUIT = PathController(
@@ -107,9 +113,9 @@ KANAYAMA = PathController(
     law=kanayama,
     summary='Kanayama et al. 1990',
     gains=(
-        _gain('k_x', 2.0, '1/s', 'Gain of kanayama on the error ahead'),
-        _gain('k_y', 25.0, '1/m^2', 'Gain of kanayama on the error to the left'),
-        _gain('k_theta', 10.0, '1/m', 'Gain of kanayama on the heading error'),
+        _gain('k_x', 'k_x', 2.0, '1/s', 'Gain of kanayama on the error ahead'),
+        _gain('k_y', 'k_y', 25.0, '1/m^2', 'Gain of kanayama on the error to the left'),
+        _gain('k_theta', 'k_{θ}', 10.0, '1/m', 'Gain of kanayama on the heading error'),
     ),
     advice=_kanayama_advice,
 )
@@ -153,7 +159,7 @@ OFFSET_POINT = PathController(
     name='offset_point',
     law=offset_point_tracking,
     summary='input-output linearization at an offset point with feed-forward, document B',
-    gains=(_gain('k_point', 1.5, '1/s', 'Gain of offset_point on the error along a path'), OFFSET),
+    gains=(_gain('k_point', 'k', 1.5, '1/s', 'Gain of offset_point on the error along a path'), OFFSET),
     advice=_offset_advice,
 )
 
@@ -204,8 +210,10 @@ DYNAMIC_FEEDBACK = PathController(
     law=dynamic_feedback_linearization,
     summary='dynamic feedback linearization, Oriolo et al. 2002',
     gains=(
-        _gain('k_position', 4.0, '1/s^2', 'Gain of dynamic_feedback on the error'),
-        _gain('k_velocity', 4.0, '1/s', 'Gain of dynamic_feedback on the derivative of the error'),
+        _gain('k_position', 'k_p', 4.0, '1/s^2', 'Gain of dynamic_feedback on the error'),
+        _gain(
+            'k_velocity', 'k_d', 4.0, '1/s', 'Gain of dynamic_feedback on the derivative of the error'
+        ),
     ),
     state=(0.0,),
 )

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.bags.bag_reader import BagError, open_bag
 from diffdrive_jacobian.bags.run import Run, Series, read_run
 from diffdrive_jacobian.bags.timeline import jumps, seconds, timeline
-from diffdrive_jacobian.control.controllers import CONTROLLERS
-from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.robot_state import MAX_POINTS, TRUTH_LIFE, RobotState, Trail
@@ -82,7 +80,6 @@ class BagPlayer:
         self._fixed = {
             'bag': path.name,
             'strips': {robot.name: robot.strips() for robot in robots},
-            'settings': {robot.name: robot.settings() for robot in robots},
             'notes': [note for robot in robots for note in robot.run.notes][:5],
         }
 
@@ -103,9 +100,11 @@ class BagPlayer:
         if state == self._shown:
             return
         self._shown = state
+        shown = [robot.shown(self.time) for robot in self._robots]
+        settings = {robot.name: robot.state.settings(imported=False) for robot in self._robots}
         self._session.store(
             Snapshot(
-                robots=[robot.shown(self.time) for robot in self._robots],
+                robots=shown,
                 trails={robot.name: robot.trail for robot in self._robots},
                 true_trails={robot.name: robot.true_trail for robot in self._robots},
                 world={
@@ -115,7 +114,7 @@ class BagPlayer:
                     'paused': self.paused,
                     'speed': self.speed,
                 },
-                fixed=self._fixed,
+                fixed={**self._fixed, 'settings': settings},
             )
         )
 
@@ -176,7 +175,7 @@ class RecordedRobot:
         self.time = np.maximum.accumulate(self._line.time + start)
         """Of each odometry, shape (n,) (s), never decreasing."""
         self._covariance = _covariances(run)
-        self._state = RobotState(name)
+        self.state = RobotState(name)
         self._configurations = list(run.configurations())
         self._configure(0)
         self._commands, self._wheels = self._times(run.cmd_vel), self._times(run.wheels)
@@ -197,7 +196,7 @@ class RecordedRobot:
 
     def shown(self, time: float) -> dict[str, Any]:
         """Return the JSON object of the robot at a time (s)."""
-        run, state = self.run, self._state
+        run, state = self.run, self.state
         index = max(0, _count(self.time, time) - 1)
         self._configure(int(run.odometry.received[index]))
         *pose, v, omega = run.odometry.values[index].tolist()
@@ -220,16 +219,20 @@ class RecordedRobot:
         """Take the parameters as of a time of recording (ns)."""
         latest = bisect_right(self._configurations, received, key=itemgetter(0)) - 1
         _, run = self._configurations[max(latest, 0)]
-        self._state.controller_values = run.of_node('go_to_goal')
-        self._state.robot_values = run.of_node('virtual_robot')
+        self.state.controller_values = run.of_node('go_to_goal')
+        self.state.robot_values = run.of_node('virtual_robot')
 
     def _set_goal(self, index: int) -> None:
-        run, line, goal = self.run, self._line, self._state.goal
+        run, line, goal = self.run, self._line, self.state.goal
         if line.path[index] >= 0:
-            goal.replay(line.paths[line.path[index]], 0, GoalState.EXECUTING)
-            assert goal.path is not None
-            goal.path.s, goal.path.across = float(line.progress[index]), float(line.across[index])
-            goal.path.heading = float(line.path_heading_error[index])
+            goal.replay(line.paths[line.path[index]], 0)
+            path = goal.path
+            assert path is not None
+            path.s, path.across = float(line.progress[index]), float(line.across[index])
+            path.heading = float(line.path_heading_error[index])
+            # NaN of a path without times, which nobody reads.
+            path.elapsed = float(line.elapsed[index])
+            path.seconds = min(path.elapsed, path.path.duration) + float(line.late[index])
             return
         number = int(line.goal[index])
         if number < 0:
@@ -239,16 +242,6 @@ class RecordedRobot:
         reached = bool(np.isnan(line.bearing_error[index]))
         state = GoalState.SUCCEEDED if reached else GoalState.EXECUTING
         goal.replay(run.goals.values[route], int(np.searchsorted(route, number)), state)
-
-    def settings(self) -> list[dict[str, Any]]:
-        """Return the recorded parameters that the page shows."""
-        values = self._state.controller_values
-        # Of another package it may be missing here, or a later one.
-        controller = CONTROLLERS.built_in.get(str(values.get('controller', '')))
-        return settings.shown(
-            {'controller': values, 'robot': self._state.robot_values},
-            controller.gains if controller else settings.recorded_gains(values),
-        )
 
     def strips(self) -> Mapping[str, Any]:
         """Return the curves over the whole bag."""
@@ -263,6 +256,8 @@ class RecordedRobot:
             'bearing_error': line.bearing_error[chosen],
             'goal_heading_error': line.goal_heading_error[chosen],
             'across': line.across[chosen],
+            'along': line.along[chosen],
+            'late': line.late[chosen],
             'path_heading_error': line.path_heading_error[chosen],
         }
         for names, times, series in (

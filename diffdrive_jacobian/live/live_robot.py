@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.control import Gain, Path
+from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import (
@@ -286,7 +286,7 @@ class LiveRobot:
             self._warn(f'there is no {printable(role, 40)} to set {printable(name, 40)} of')
             return
         try:
-            setting = settings.find(command.parameter, self._gains())
+            setting = settings.find(command.parameter, self.state.controller_values)
             value = setting.checked(command.value)
         except settings.SettingError as error:
             self._warn(str(error))
@@ -402,13 +402,8 @@ class LiveRobot:
 
     def settings(self) -> list[dict[str, Any]]:
         """Return the settings for the page."""
-        values = {role: link.values for role, link in self.links.items()}
         ranges = {role: link.ranges for role, link in self.links.items()}
-        return settings.shown(values, self._gains(), ranges)
-
-    def _gains(self) -> tuple[Gain, ...]:
-        """Return the gains of the controller that is chosen."""
-        return settings.gains(str(self.state.controller_values.get('controller', '')))
+        return self.state.settings(ranges, imported=True)
 
     def destroy(self) -> None:
         """Destroy all entities."""

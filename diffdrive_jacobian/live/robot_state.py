@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.run import number
 from diffdrive_jacobian.bags.timeline import heading_counts
-from diffdrive_jacobian.control import Arrival, LawError, Path
+from diffdrive_jacobian.control import Arrival, Controller, LawError, Path
 from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.control.path import PathProgress
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
-from diffdrive_jacobian.live import quantities
+from diffdrive_jacobian.live import quantities, settings
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.messages.goal_status import (
     UNSTAMPED,
@@ -27,11 +27,15 @@ from diffdrive_jacobian.messages.goal_status import (
     GoalState,
     Stamp,
 )
+from diffdrive_jacobian.parameters.chosen_law import chosen_law
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 
 ROBOT_DEFAULTS = VirtualRobotParameters()
 CONTROLLER_DEFAULTS = GoToGoalParameters()
+APPROACH = 'path_approach_distance', CONTROLLER_DEFAULTS.path_approach_distance
+MAX_STEP = 1.0
+"""Longest time between two odometry messages during which a trajectory goes on (s)."""
 Values = Mapping[str, Any]
 Goals = NDArray[np.float64]
 """`[x, y, theta]` of each, shape (n, 3) (m, m, rad)."""
@@ -183,17 +187,28 @@ class GoalProgress:
             self._shown = changed
         return changed
 
-    def replay(self, goals: Goals | Path | None, index: int, state: GoalState) -> None:
+    def replay(
+        self, goals: Goals | Path | None, index: int, state: GoalState = GoalState.EXECUTING
+    ) -> None:
         """Show recorded goals or a recorded path, and their state."""
         self._shown, self.index = FollowedGoal(goals, UNSTAMPED, state), index
         self._use(goals)
 
-    def moved(self, pose: NDArray[np.float64], arrival: Arrival) -> None:
-        """Take a pose of the robot, `[x, y, theta]`: a waypoint may be reached."""
+    def moved(
+        self,
+        pose: NDArray[np.float64],
+        arrival: Arrival,
+        dt: float = 0.0,
+        approach: float = math.inf,
+    ) -> None:
+        """Take a pose of the robot, `[x, y, theta]`: a waypoint may be reached.
+
+        `dt` and `approach` are those of `PathProgress.moved`.
+        """
         if self.goals is None or not self.active:
             return
         if self.path is not None:
-            self.path.moved(pose)
+            self.path.moved(pose, dt, approach)
             passed = self.path.path.arc_lengths.searchsorted(self.path.s, 'right')
             self.index = min(int(passed), len(self.goals) - 1)
             return
@@ -208,8 +223,11 @@ class GoalProgress:
         common = {'state': self.state.name.lower(), 'active': self.active}
         if self.path is not None:
             # All poses would be too many, many times a second.
-            end = rounded(self.path.path.poses[-1:])
-            return {**common, 'goals': end, 'index': 0, 'path': self._points}
+            path, reference = self.path.path, None
+            if path.times is not None and self.active:
+                reference = rounded(path.at_time(self.path.elapsed)[:3])
+            shown = {'goals': rounded(path.poses[-1:]), 'index': 0, 'path': self._points}
+            return {**common, **shown, 'reference': reference}
         return {**common, 'goals': rounded(self.goals), 'index': self.index}
 
     def _show(self, followed: FollowedGoal[Goals | Path]) -> None:
@@ -330,14 +348,16 @@ class RobotState:
         jump = JUMP
         if self._placed:
             self._placed, jump = self._placed - 1, PLACED_JUMP
-        far = _longest(time - self.time, twist, self.twist)
+        elapsed = time - self.time if self.pose is not None else 0.0
+        far = _longest(elapsed, twist, self.twist)
         self.trail = self.trail.extended(float(pose[0]), float(pose[1]), max(jump, far))
         self.time, self.pose, self.twist = time, pose, twist
         if abs(time - self._true_time) > TRUTH_LIFE:
             self.truth = None
         if covariance is not None:
             self.covariance = covariance
-        self.goal.moved(pose, self.arrival)
+        approach = _number(self.controller_values, *APPROACH)
+        self.goal.moved(pose, self.arrival, min(max(elapsed, 0.0), MAX_STEP), approach)
 
     def truly_moved(self, time: float, pose: NDArray[np.float64], twist: tuple[float, float]) -> None:
         """Take a ground truth."""
@@ -379,49 +399,62 @@ class RobotState:
             if self.truth is not None:
                 true_distance, _ = quantities.errors(self.truth, target, arrival.offset)
         command = self.command or (0.0, 0.0)
+        chain = quantities.chain(
+            float(self.pose[2]), command, self.wheels, geometry, self.radius_multipliers
+        )
+        now = {
+            'v': self.twist[0],
+            'omega': self.twist[1],
+            'command_v': None if self.command is None else command[0],
+            'command_omega': None if self.command is None else command[1],
+            'right': chain['wheels'][0],
+            'left': chain['wheels'][1],
+            'distance': distance,
+            'bearing_error': bearing,
+            'goal_heading_error': heading,
+            'across': None if path is None else path.across,
+            'along': None if path is None else path.along,
+            'path_heading_error': None if path is None else path.heading,
+            'late': None if path is None else path.late,
+        }
         return {
             'name': self.name,
             'time': round(self.time, 4),
             'age': round(age, 2),
             'pose': rounded(self.pose),
-            'twist': rounded(self.twist),
             'region': quantities.region(self.covariance),
             'geometry': geometry,
             'goal': self.goal.shown(),
             'tolerance': arrival.xy_tolerance,
             'use_heading': arrival.use_heading,
             'offset': arrival.offset,
-            'distance': rounded(distance),
+            'now': {name: rounded(value) for name, value in now.items()},
             'true_distance': rounded(true_distance),
-            'bearing_error': rounded(bearing),
-            'goal_heading_error': rounded(heading),
-            'across': rounded(None if path is None else path.across),
-            'path_heading_error': rounded(None if path is None else path.heading),
             'truth': rounded(self.truth),
             'law': self._law(target if self.goal.active else None),
             'by_hand': by_hand,
             'commanded': self.command is not None,
-            'chain': quantities.chain(
-                float(self.pose[2]), command, self.wheels, geometry, self.radius_multipliers
-            ),
+            'chain': chain,
         }
 
     def _law(self, target: NDArray[np.float64] | None) -> dict[str, Any]:
-        """Return the name of the law, its gains, and what it computes here without limits."""
-        values = self.controller_values
-        if self.goal.path is not None:
-            name = str(values.get('path_controller', ''))[:64]
-            # The twist is that of the look-ahead or the time of the node, which are not known here.
-            return {'name': name, 'gains': {}, 'twist': None}
-        name = str(values.get('controller', ''))[:64]
-        # Only built-in ones: another one may be slow, and runs in the controller.
-        controller = CONTROLLERS.built_in.get(name)
-        if controller is None:
-            return {'name': name, 'gains': {}, 'twist': None}
-        gains = {gain.name: _number(values, gain.name, math.nan) for gain in controller.gains}
+        """Return the name of the law, its gains, and what it computes here without limits.
+
+        That is not known of a path, for the look-ahead is the controller's, nor of a law of another
+        package, which may be slow.
+        """
+        name, law, gains, values = chosen_law(self.controller_values, path=self.goal.path is not None)
         twist = None
-        if target is not None and self.pose is not None:
+        if target is not None and self.pose is not None and isinstance(law, Controller):
             with suppress(LawError):
-                twist = controller.bind(SimpleNamespace(**gains))(self.pose, target)
-        labels = {gain.label or gain.name: rounded(gains[gain.name]) for gain in controller.gains}
+                twist = law.bind(SimpleNamespace(**values))(self.pose, target)
+        labels = {gain.label or gain.name: rounded(values[gain.name]) for gain in gains}
         return {'name': name, 'gains': labels, 'twist': rounded(twist)}
+
+    def settings(
+        self, ranges: Mapping[str, Mapping[str, settings.Range]] | None = None, *, imported: bool
+    ) -> list[dict[str, Any]]:
+        """Return the settings for the page; the arguments are those of `settings.shown`."""
+        values = {'controller': self.controller_values, 'robot': self.robot_values}
+        path = self.goal.path is not None
+        return settings.shown(values, ranges or {}, path=path, imported=imported)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, Literal
 
-from diffdrive_jacobian.control import ControllerError, Gain, controller_names, find_controller
+from diffdrive_jacobian.control import ControllerError, Gain
+from diffdrive_jacobian.control.controllers import ALL_PATH_CONTROLLERS, CONTROLLERS, Controllers
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.live.quantities import rounded
+from diffdrive_jacobian.parameters.chosen_law import chosen_law
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.text import printable
@@ -29,7 +30,11 @@ TYPES: dict[str, type[float | str | bool]] = {
     'flag': bool,
 }
 """Type of the values of each kind of setting."""
-TAKES_TIME = 'Time to follow commands'
+TAKES_TIME = 'Time to follow'
+GROUPS = {'goal': 'For goals', 'path': 'Along a path'}
+"""Headings of what concerns the one while the other is driven."""
+Values = Mapping[str, Any]
+"""Parameters by name."""
 
 
 class SettingError(DiffdriveError, ValueError):
@@ -39,6 +44,9 @@ class SettingError(DiffdriveError, ValueError):
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Setting:
     """A parameter of a node as the page offers it."""
+
+    of: Literal['goal', 'path', ''] = ''
+    """What it concerns: goals or paths; '': both."""
 
     role: Role
     """The node: the one that publishes goal_status, or the one that publishes odom."""
@@ -55,7 +63,7 @@ class Setting:
     kind: Literal['number', 'limit', 'choice', 'flag'] = 'number'
     """`limit`: a number, or NaN for none."""
     group: str = ''
-    """Heading below which it is folded away while none of the group is in use; '': always shown."""
+    """Heading below which it is folded away; '': always shown."""
 
     def slider(self, served: Range | None) -> Range:
         """Return the range of the slider for a node that serves a range in its descriptor."""
@@ -80,9 +88,13 @@ class Setting:
 
 
 _OFFERED = (
-    Setting(role='controller', name='controller', label='Control law', kind='choice',
+    Setting(of='goal', role='controller', name='controller', label='Control law', kind='choice',
             hint='How goal and pose become v and ω'),
-    Setting(role='controller', name='use_goal_heading', label='Goal heading', kind='flag',
+    Setting(of='path', role='controller', name='path_controller', label='Path law', kind='choice',
+            hint='How the pose and the point of the path become v and ω'),
+    Setting(of='path', role='controller', name='path_speed', label='Speed', unit='m/s', low=0.02,
+            high=1.0, hint='Speed along a path without times'),
+    Setting(of='goal', role='controller', name='use_goal_heading', label='Goal heading', kind='flag',
             hint='Turn in place to the heading of the last goal'),
     Setting(role='controller', name='xy_goal_tolerance', label='Tolerance', unit='m', low=0.005,
             high=0.5, hint='Distance that counts as arrived: the circle around the goal'),
@@ -92,6 +104,8 @@ _OFFERED = (
             high=6.0, kind='limit', hint='Both speeds are scaled alike, so the path stays the same'),
     Setting(role='robot', name='max_wheel_velocity', label='Wheel limit', unit='rad/s', low=1.0,
             high=40.0, kind='limit', hint='Both wheels are scaled alike'),
+    Setting(role='robot', name='wheel_travel_variance', label='Wheel noise', unit='m', low=0.0,
+            high=0.002, hint='Variance per distance: how fast the uncertainty region grows'),
     Setting(role='robot', group=TAKES_TIME, name='linear.x.max_acceleration',
             label='Limit of dv/dt', unit='m/s²',
             low=0.05, high=3.0, kind='limit', hint='The path stays a circle from and to rest'),
@@ -104,8 +118,6 @@ _OFFERED = (
     Setting(role='robot', group=TAKES_TIME, name='command_delay',
             label='Delay', unit='s', low=0.0, high=1.0,
             hint='Time from a command to its effect'),
-    Setting(role='robot', name='wheel_travel_variance', label='Wheel noise', unit='m', low=0.0,
-            high=0.002, hint='Variance per distance: how fast the uncertainty region grows'),
 )  # fmt: skip
 _DECLARED = {
     'controller': GoToGoalParameters().declared(),
@@ -116,31 +128,43 @@ SETTINGS = [replace(one, declared=_DECLARED[one.role][one.name].limits) for one 
 
 
 @lru_cache(maxsize=16)
-def gains(controller: str) -> tuple[Gain, ...]:
-    """Return the gains of a controller; of one that is not installed here they are unknown."""
+def _installed(registry: Controllers[Any], name: str) -> tuple[Gain, ...] | None:
+    """Return the gains of a law that is installed here; None: it is not."""
     try:
-        return find_controller(controller).gains
+        return tuple(registry.find(name).gains)
     except ControllerError:
-        return ()
+        return None
 
 
-def recorded_gains(values: Mapping[str, Any]) -> tuple[Gain, ...]:
-    """Return the gains among the recorded parameters of a go_to_goal: those that are not its own.
+def gains(values: Values, *, path: bool, imported: bool) -> tuple[Gain, ...]:
+    """Return the gains of the law of goals or of paths that the parameters of a controller choose.
 
-    Their descriptions and ranges are in the package of the controller, which may be missing here.
+    A law of another package is imported only if that is wanted, for its descriptions and ranges.
     """
-    own = _DECLARED['controller']
-    found = []
-    for name, value in values.items():
-        if name not in own and isinstance(value, float):
-            with suppress(ValueError):
-                found.append(Gain(name=name, default=value, unit='', description='Gain, as recorded'))
-    return tuple(found)
+    registry = ALL_PATH_CONTROLLERS if path else CONTROLLERS
+    chosen = chosen_law(values, path=path)
+    if chosen.law is None and chosen.name and imported:
+        return _installed(registry, chosen.name) or chosen.gains
+    return chosen.gains
 
 
-def offered(gains: Iterable[Gain]) -> list[Setting]:
-    """Return what the page offers for a controller with some gains."""
-    sliders = [
+def offered(values: Values, *, path: bool, imported: bool) -> list[Setting]:
+    """Return what the page offers for a controller with these parameters.
+
+    What concerns what it drives now, goals or a path, comes first, the other is folded away.
+    """
+    now, other = ('path', 'goal') if path else ('goal', 'path')
+    found: dict[str, Setting] = {}
+    for of in (now, '', other):
+        of_law = gains(values, path=of == 'path', imported=imported) if of else ()
+        for one in (*_sliders(of_law), *(one for one in SETTINGS if one.of == of)):
+            group = GROUPS[other] if of == other else one.group
+            found.setdefault(one.key, replace(one, group=group))
+    return list(found.values())
+
+
+def _sliders(gains: Iterable[Gain]) -> list[Setting]:
+    return [
         Setting(
             role='controller',
             name=gain.name,
@@ -153,32 +177,37 @@ def offered(gains: Iterable[Gain]) -> list[Setting]:
         )
         for gain in gains
     ]
-    return [*sliders, *SETTINGS]
 
 
-def find(key: str, gains: Iterable[Gain]) -> Setting:
-    """Return a setting by its name on the page.
+def find(key: str, values: Values) -> Setting:
+    """Return a setting by its name on the page, for a controller with these parameters.
 
     Raises:
         SettingError: There is none.
     """
-    for setting in offered(gains):
+    for setting in offered(values, path=False, imported=True):
         if setting.key == key:
             return setting
     raise SettingError(f'there is no setting {printable(key, 40)}')
 
 
 def shown(
-    values: Mapping[str, Mapping[str, Any]],
-    gains: Iterable[Gain],
+    values: Mapping[str, Values],
     ranges: Mapping[str, Mapping[str, Range]] = MappingProxyType({}),
+    *,
+    path: bool,
+    imported: bool,
 ) -> list[dict[str, Any]]:
     """Return the settings that nodes have, with their values, for the page.
 
-    `values` and `ranges` are the parameters by role, and the ranges that the nodes serve.
+    Args:
+        values: Parameters of the nodes by role.
+        ranges: Ranges that the nodes serve, by role.
+        path: Whether a path is driven along.
+        imported: As for `gains`.
     """
     found = []
-    for setting in offered(gains):
+    for setting in offered(values.get('controller', {}), path=path, imported=imported):
         value = values.get(setting.role, {}).get(setting.name)
         if not isinstance(value, TYPES[setting.kind]):
             continue
@@ -188,6 +217,8 @@ def shown(
             'label': setting.label,
             'hint': setting.hint,
             'group': setting.group,
+            # Its group is folded away otherwise.
+            'used': setting.group == TAKES_TIME and bool(rounded(value)),
             'unit': setting.unit,
             'kind': setting.kind,
             'low': low,
@@ -195,12 +226,13 @@ def shown(
             'value': value[:64] if isinstance(value, str) else rounded(value),
         }
         if setting.kind == 'choice':
-            row['choices'] = list(dict.fromkeys([*_controllers()[:MAX_CHOICES], row['value']]))
+            names = _names(setting.name)[:MAX_CHOICES]
+            row['choices'] = list(dict.fromkeys([*names, row['value']]))
         found.append(row)
     return found
 
 
-@lru_cache(maxsize=1)
-def _controllers() -> tuple[str, ...]:
+@lru_cache(maxsize=2)
+def _names(parameter: str) -> tuple[str, ...]:
     # To find the installed ones takes many milliseconds.
-    return tuple(controller_names())
+    return tuple(ALL_PATH_CONTROLLERS if parameter == 'path_controller' else CONTROLLERS)

@@ -74,7 +74,8 @@ def test_the_robot_is_where_it_was(bag, player):
     for index in (0, 10, 20, len(odometry) - 1):
         player.send(Seek(float(times[index]) + 1e-6))
         assert player.robot['pose'] == pytest.approx(odometry.values[index, :3].tolist(), abs=1e-5)
-        assert player.robot['twist'] == pytest.approx(odometry.values[index, 3:].tolist(), abs=1e-4)
+        twist = [player.robot['now'][name] for name in ('v', 'omega')]
+        assert twist == pytest.approx(odometry.values[index, 3:].tolist(), abs=1e-4)
     assert player.robot['region']['a'] > 0.0
 
 
@@ -86,7 +87,7 @@ def test_goals_and_the_chain_are_as_recorded(player):
         [0.4, 0.4, 0.0],
     ]
     assert (robot['goal']['index'], robot['goal']['state']) == (0, 'executing')
-    assert robot['law']['gains']['Kp'] == QUICK['kp']
+    assert robot['law']['gains']['K_p'] == QUICK['kp']
     assert robot['commanded']
     chain = robot['chain']
     assert np.array(chain['forward']) @ chain['wheels'] == pytest.approx(chain['twist'], rel=1e-4)
@@ -123,6 +124,8 @@ def test_time_plays_pauses_steps_and_jumps(player):
 def test_curves_and_parameters_of_the_whole_bag(player):
     fixed = player.snapshot.fixed
     strips = fixed['strips']['/']
+    # A page draws the same curves of a bag and of a robot that runs.
+    assert {*strips} == {'time', *player.robot['now']}
     assert len({len(curve) for curve in strips.values()}) == 1
     assert strips['distance'][0] == pytest.approx(0.4, abs=0.05)
     assert max(value for value in strips['left'] if value is not None) > 1.0

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from support.lockstep_nodes import QUICK, make_complete
 
-from diffdrive_jacobian.control.controller import KP, KV
+from diffdrive_jacobian.control.controller import KP
 from diffdrive_jacobian.live import hand, settings
 from diffdrive_jacobian.live import node as live_node
 from diffdrive_jacobian.live.commands import (
@@ -81,6 +81,10 @@ class Live:
         return self.robot(name)['goal']['state']
 
 
+def at_rest(robot):
+    return (robot['now']['v'], robot['now']['omega']) == (0.0, 0.0)
+
+
 @pytest.fixture
 def live(lockstep, monkeypatch):
     monkeypatch.setattr(live_node, 'PERIOD', 0.0)
@@ -110,9 +114,9 @@ def test_a_goal_is_driven_to_and_every_number_of_the_chain_is_there(driven):
     robot = driven.robot()
     # Without a heading it is approached straight.
     assert robot['goal']['goals'][0] == pytest.approx([0.4, 0.3, math.atan2(0.3, 0.4)], abs=1e-5)
-    assert robot['distance'] == pytest.approx(0.5, abs=0.02)
+    assert robot['now']['distance'] == pytest.approx(0.5, abs=0.02)
     assert robot['law']['name'] == 'go_to_goal'
-    assert robot['law']['gains']['Kp'] == QUICK['kp']
+    assert robot['law']['gains']['K_p'] == QUICK['kp']
     assert robot['tolerance'] == 0.02
     chain = robot['chain']
     assert chain['measured']
@@ -122,8 +126,8 @@ def test_a_goal_is_driven_to_and_every_number_of_the_chain_is_there(driven):
     assert world == pytest.approx(np.array(chain['world']), rel=1e-4, abs=1e-6)
     driven.until(lambda: driven.state() == 'succeeded')
     robot = driven.robot()
-    assert robot['distance'] == pytest.approx(math.dist(robot['pose'][:2], (0.4, 0.3)), abs=1e-5)
-    assert robot['bearing_error'] is None
+    assert robot['now']['distance'] == pytest.approx(math.dist(robot['pose'][:2], (0.4, 0.3)), abs=1e-5)
+    assert robot['now']['bearing_error'] is None
     assert robot['region']['a'] > robot['region']['b'] > 0.0
     assert len(driven.snapshot.trails['/'].points) > 10
 
@@ -149,7 +153,7 @@ def test_waypoints_are_appended_and_the_ends_of_goals_are_reported(driven):
     driven.send(CancelGoal('/'))
     driven.until(lambda: driven.state() == 'canceled')
     driven.pass_time(0.1)
-    assert driven.robot()['twist'] == [0.0, 0.0]
+    assert at_rest(driven.robot())
     driven.send(CancelGoal('/'))
     driven.until(lambda: any('no goal is active' in text for text in driven.texts))
     assert [(end.robot, end.state.name) for end in ends] == [('/', 'SUCCEEDED'), ('/', 'CANCELED')]
@@ -199,13 +203,13 @@ def test_a_goal_is_refused_while_the_robot_is_driven_by_hand(driven):
     driven.send(DriveByHand('/', -0.9, 0.0), page=other)
     driven.pass_time(0.1)
     assert 'another page drives this robot by hand' in driven.texts
-    assert driven.robot()['twist'][0] == pytest.approx(0.2)
+    assert driven.robot()['now']['v'] == pytest.approx(0.2)
     driven.send(Release('/'), page=other)
     driven.pass_time(0.1)
     assert driven.robot()['by_hand']
     driven.send(Release('/'))
     driven.pass_time(0.1)
-    assert driven.robot()['twist'] == [0.0, 0.0]
+    assert at_rest(driven.robot())
 
 
 def test_parameters_are_set_and_refusals_are_shown(driven):
@@ -238,7 +242,10 @@ def test_parameters_are_set_and_refusals_are_shown(driven):
     (robot,) = driven.node.robots.values()
     assert robot.links['controller'].ranges['kp'] == (0.0, KP.bounds[1])
     ranges = {key: (row['low'], row['high']) for key, row in driven.settings().items()}
-    assert ranges == {one.key: (one.low, one.high) for one in settings.offered((KP, KV))}
+    values = driven.node.robots['/'].state.controller_values
+    assert ranges == {
+        one.key: (one.low, one.high) for one in settings.offered(values, path=False, imported=False)
+    }
     # What others change is followed.
     controller = next(node for node in driven.world.nodes if isinstance(node, GoToGoal))
     controller.set_parameters([Parameter('kv', value=1.25)])
@@ -314,7 +321,7 @@ def test_a_slow_robot_takes_stamped_commands_and_the_end_says_how_far_it_rolls(l
     live.send(SetParameter('/', 'robot/linear.x.max_acceleration', 0.2))
     live.until(lambda: live.settings()['robot/linear.x.max_acceleration']['value'] == 0.2)
     live.send(DriveByHand('/', 0.2, 0.0))
-    live.until(lambda: live.robot()['twist'][0] == pytest.approx(0.2), timeout=2.0)
+    live.until(lambda: live.robot()['now']['v'] == pytest.approx(0.2), timeout=2.0)
     live.send(Release('/'))
     live.until(lambda: any('rolls on for about 0.100 m' in text for text in live.texts), timeout=2.0)
 
@@ -366,7 +373,7 @@ def test_a_robot_that_slips_is_shown_where_it_truly_is(live):
     live.pass_time(0.2)
     shown = live.robot()
     assert shown['true_distance'] == pytest.approx(math.dist(shown['truth'][:2], (0.5, 0.25)), abs=1e-4)
-    assert shown['true_distance'] != shown['distance']
+    assert shown['true_distance'] != shown['now']['distance']
     live.until(lambda: live.state() == 'succeeded')
     live.pass_time(0.2)
     assert live.robot()['truth'] == pytest.approx(robot.truth.tolist(), abs=1e-4)
@@ -386,13 +393,13 @@ def test_the_robot_is_placed_and_the_heading_of_a_goal_is_shown_where_it_counts(
     driven.until(lambda: driven.robot()['pose'] == [0.0, 0.0, 0.0])
     driven.send(goal(0.3, 0.0), goal(0.3, 0.1, 2.0))
     driven.until(lambda: driven.state() == 'executing')
-    assert driven.robot()['goal_heading_error'] is None
+    assert driven.robot()['now']['goal_heading_error'] is None
     (text,) = driven.texts
     assert text.startswith('go_to_goal ignores the heading of the goal')
     driven.send(SetParameter('/', 'controller/use_goal_heading', value=True))
     driven.until(lambda: driven.robot()['use_heading'])
     shown = driven.robot()
-    assert shown['goal_heading_error'] == pytest.approx(2.0 - shown['pose'][2], abs=1e-4)
+    assert shown['now']['goal_heading_error'] == pytest.approx(2.0 - shown['pose'][2], abs=1e-4)
     assert shown['truth'] is None
     driven.send(goal(0.3, 0.2, 2.0))
     driven.pass_time(0.1)

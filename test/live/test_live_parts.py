@@ -9,7 +9,8 @@ import re
 import numpy as np
 import pytest
 
-from diffdrive_jacobian.control import KP, KV, Arrival, circle_path
+from diffdrive_jacobian.control import Arrival, circle_path, line_path
+from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
 from diffdrive_jacobian.kinematics import diff_drive, se2
 from diffdrive_jacobian.live import robot_state, settings
 from diffdrive_jacobian.live.commands import (
@@ -30,6 +31,7 @@ from diffdrive_jacobian.live.robot_state import SPACING, GoalProgress, RobotStat
 from diffdrive_jacobian.live.server import page_files
 from diffdrive_jacobian.live.session import MAX_COMMANDS, MAX_NOTICES, Session, Snapshot
 from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 
 # --- Commands of the page
 
@@ -346,20 +348,45 @@ def test_a_planned_path_is_shown_with_its_errors():
     for x in (0.0, 0.1):
         state.moved(x, np.array([x, -0.05, 0.2]), (1.0, 0.0), None)
     shown = json.loads(json.dumps(state.shown(age=0.0, by_hand=False), allow_nan=False))
-    assert (shown['law']['name'], shown['bearing_error']) == ('kanayama', None)
+    now = shown['now']
+    assert (shown['law']['name'], now['bearing_error']) == ('kanayama', None)
     away = math.hypot(0.1, 1.05) - 1.0
-    assert shown['across'] == pytest.approx(-away, abs=1e-4)
+    assert now['across'] == pytest.approx(-away, abs=1e-4)
     passed = math.atan2(0.1, 1.05)
-    assert shown['path_heading_error'] == pytest.approx(0.2 - passed, abs=1e-4)
-    assert shown['distance'] == pytest.approx(2.0 * math.pi - passed, abs=2e-3)
+    assert now['path_heading_error'] == pytest.approx(0.2 - passed, abs=1e-4)
+    assert now['distance'] == pytest.approx(2.0 * math.pi - passed, abs=2e-3)
     places = np.array(shown['goal']['path'])
     np.testing.assert_allclose(np.hypot(places[:, 0], places[:, 1] - 1.0), 1.0, atol=1e-3)
     assert len(shown['goal']['goals']) == 1
+    # It has no times.
+    assert (now['along'], now['late'], shown['goal']['reference']) == (None, None, None)
     state.goal.sent(at(2.0, 2.0), (2, 0))
     state.goal.reported(GoalState.EXECUTING, (2, 0))
     shown = state.shown(age=0.0, by_hand=False)
-    assert (shown['across'], shown['goal'].get('path')) == (None, None)
+    assert (shown['now']['across'], shown['goal'].get('path')) == (None, None)
     assert shown['law']['name'] == 'go_to_goal'
+
+
+def test_a_trajectory_waits_for_a_robot_that_is_far_from_it():
+    state = RobotState('/')
+    state.controller_values = {'path_controller': 'pure_pursuit', 'path_approach_distance': 0.2}
+    state.goal.sent(line_path(2.0).timed(0.5), (1, 0))
+    state.goal.reported(GoalState.EXECUTING, (1, 0))
+
+    def moved(time, x):
+        state.moved(time, np.array([x, 0.0, 0.0]), (0.5, 0.0), None)
+        shown = state.shown(age=0.0, by_hand=False)
+        return shown['now'], shown['goal']['reference']
+
+    moved(5.0, 0.0)
+    now, reference = moved(5.2, 0.1)
+    assert (now['along'], now['late'], reference[0]) == pytest.approx((0.0, 0.0, 0.1), abs=1e-9)
+    # It stands: once the times are 0.2 m ahead they wait, a step later.
+    for step in range(10):
+        now, reference = moved(5.3 + 0.1 * step, 0.1)
+    assert reference[0] == pytest.approx(0.35)
+    assert now['along'] == pytest.approx(0.1 - 0.35)
+    assert now['late'] == pytest.approx(0.5)
 
 
 # --- Sessions
@@ -401,19 +428,47 @@ def test_commands_and_notices_are_bounded():
 # --- Settings
 
 
+def shown_rows(values, **how):
+    rows = settings.shown({'controller': values}, **{'path': False, 'imported': False, **how})
+    return {row['key'].partition('/')[2]: row for row in rows}
+
+
 def test_settings_that_are_shown_and_taken():
-    values = {'controller': {'kp': 3.0, 'controller': 'mine', 'linear.x.max_velocity': math.nan}}
-    rows = {row['key']: row for row in settings.shown(values, (KP, KV))}
-    assert set(rows) == {f'controller/{name}' for name in values['controller']}
-    assert rows['controller/controller']['choices'][-1] == 'mine'
-    assert rows['controller/linear.x.max_velocity']['value'] is None
-    assert settings.find('controller/kp', (KP,)).checked(2.0) == 2.0
-    assert math.isnan(settings.find('robot/max_wheel_velocity', ()).checked(None))
+    values = {'kp': 3.0, 'my_gain': 2.0, 'controller': 'mine', 'linear.x.max_velocity': math.nan}
+    rows = shown_rows(values)
+    # Of a law that is not known here what is no parameter of every go_to_goal, which kp is.
+    assert set(rows) == {'my_gain', 'controller', 'linear.x.max_velocity'}
+    assert rows['controller']['choices'][-1] == 'mine'
+    assert rows['linear.x.max_velocity']['value'] is None
+    own = {'controller': 'go_to_goal'}
+    assert settings.find('controller/kp', own).checked(2.0) == 2.0
+    assert math.isnan(settings.find('robot/max_wheel_velocity', own).checked(None))
     for key, value in (('controller/kp', None), ('controller/kp', 'a'), ('controller/controller', 1.0)):
         with pytest.raises(settings.SettingError):
-            settings.find(key, (KP,)).checked(value)
-    with pytest.raises(settings.SettingError, match='there is no setting'):
-        settings.find('controller/use_sim_time', (KP,))
+            settings.find(key, own).checked(value)
+    for unknown in ('controller/use_sim_time', 'controller/k_x', 'kp', ''):
+        with pytest.raises(settings.SettingError, match='there is no setting'):
+            settings.find(unknown, own)
+
+
+@pytest.mark.parametrize('law', PATH_CONTROLLERS, ids=lambda one: one.name)
+def test_on_a_path_its_law_and_gains_come_first_and_those_of_goals_are_folded(law):
+    values = {name: one.default for name, one in GoToGoalParameters().declared().items()} | {
+        'path_controller': law.name,
+        'controller': 'pose',
+    }
+    driven, idle = shown_rows(values, path=True), shown_rows(values)
+    own = [gain.name for gain in law.gains]
+    assert [*driven][: len(own) + 2] == [*own, 'path_controller', 'path_speed']
+    assert {driven[name]['group'] for name in (*own, 'path_controller')} == {''}
+    assert {driven[name]['group'] for name in ('kp', 'kv', 'controller')} == {'For goals'}
+    assert [*idle][:2] == ['kp', 'kv']
+    assert {idle[name]['group'] for name in (*own, 'path_controller')} == {'Along a path'}
+    assert {*driven} == {*idle}
+    # It can be set at any time.
+    for name in own:
+        assert settings.find(f'controller/{name}', values).checked(1.5) == 1.5
+    assert set(driven['path_controller']['choices']) >= {one.name for one in PATH_CONTROLLERS}
 
 
 # --- Files of the page

@@ -42,13 +42,13 @@ def test_watch_run_beside_nodes_and_the_robot_stops_with_the_page(world):
 
         def moving():
             page.send(drive)
-            return robots(page)['/r']['twist'][0] == 0.3
+            return robots(page)['/r']['now']['v'] == 0.3
 
         until(moving, 'it drives')
         # The network fails: no closing handshake.
         page.socket.shutdown(socket.SHUT_RDWR)
     with opened(watch) as page:
-        until(lambda: robots(page)['/r']['twist'][0] == 0.0, 'it stops')
+        until(lambda: robots(page)['/r']['now']['v'] == 0.0, 'it stops')
         watch.signal(signal.SIGINT)
         assert watch.exit() == 0
     assert watch.stderr == ''

@@ -10,9 +10,9 @@ const LAWS = {
 const GOAL = 'd = |p_{goal} − p|,  e = ∠(p_{goal} − p) − θ';
 const PATH_LAWS = {
   pure_pursuit: ['v = v_r,  ω = 2 v y / l_d²', 'Coulter 1992'],
-  kanayama: ['v = v_r cos e_{θ} + K_x e_x,  ω = ω_r + v_r (K_y e_y + K_{θ} sin e_{θ})', 'Kanayama 1990'],
+  kanayama: ['v = v_r cos e_{θ} + k_x e_x,  ω = ω_r + v_r (k_y e_y + k_{θ} sin e_{θ})', 'Kanayama 1990'],
   offset_point: ['w = J_d⁻¹ (ṗ_r + k (p_r − p_d))', 'B'],
-  dynamic_feedback: ['u = p̈_r + K_d (ṗ_r − ṗ) + K_p (p_r − p),  ω = (u_2 cos θ − u_1 sin θ) / ξ', 'Oriolo 2002'],
+  dynamic_feedback: ['u = p̈_r + k_d (ṗ_r − ṗ) + k_p (p_r − p),  ω = (u_2 cos θ − u_1 sin θ) / ξ', 'Oriolo 2002'],
 };
 
 /** A vector or matrix whose numbers change. `classes` has one name for each row. */
@@ -41,6 +41,12 @@ function link(title, equation, source, symbolic, ...numbers) {
   return { node: element('div', { class: 'link' }, heading,
     element('div', { class: 'formula' }, formula, symbolic), element('div', { class: 'numbers' }, ...numbers)), heading, formula };
 }
+
+const toGoal = (target, now) => `(${format(target[0], 2)}, ${format(target[1], 2)}) m   →   d = ${format(now.distance)} m,  e = ${format(now.bearing_error)} rad`
+  + (now.goal_heading_error === null ? '' : `, heading at the goal: Δθ = ${format(now.goal_heading_error)} rad`);
+
+const onPath = (now) => `${format(now.distance)} m to go; ${format(Math.abs(now.across))} m ${now.across < 0 ? 'right' : 'left'} of it, turned by ${format(now.path_heading_error)} rad`
+  + (now.late === null ? '' : `, ${format(Math.abs(now.along))} m ${now.along < 0 ? 'behind' : 'ahead of'} its times, ${format(now.late, 1)} s late`);
 
 const unit = (text) => element('span', { class: 'unit' }, text);
 
@@ -74,13 +80,11 @@ export class Chain {
   }
 
   show(robot, recorded) {
-    const { chain, law, goal } = robot, active = robot.distance !== null && goal.active;
+    const { chain, law, goal, now } = robot, active = now.distance !== null && goal.active;
     const target = active && goal.goals ? goal.goals[goal.index] : null, path = goal.path;
     setMath(this.links.goal.formula, path ? '[e_x, e_y] = R(θ)ᵀ (p_r − p),  e_{θ} = θ_r − θ' : GOAL);
-    setText(this.goal, target && path
-      ? `path: ${format(robot.distance)} m to go, ${format(robot.across)} m to the left of it, Δθ = ${format(robot.path_heading_error)} rad`
-      : target
-      ? `(${format(target[0], 2)}, ${format(target[1], 2)}) m   →   d = ${format(robot.distance)} m,  e = ${format(robot.bearing_error)} rad${robot.goal_heading_error === null ? '' : `, heading at the goal: Δθ = ${format(robot.goal_heading_error)} rad`}`
+    setText(this.goal, target && path ? onPath(now)
+      : target ? toGoal(target, now)
       : robot.by_hand ? 'none: driven by hand' : recorded ? 'none' : 'none: click on the map');
     this.links.goal.node.classList.toggle('idle', !target);
     const [formula, source] = (path ? PATH_LAWS : LAWS)[law.name] ?? ['[v, ω] = law(pose, goal)', law.name || 'not known'];
@@ -107,8 +111,9 @@ export class Chain {
   /** Return the gains, and the factor by which limits scale what the law computes. */
   describe(robot) {
     const { law, chain } = robot;
-    if (robot.by_hand || !robot.commanded || !law.twist) return '';
+    if (robot.by_hand || !robot.commanded) return '';
     const gains = Object.entries(law.gains).map(([name, value]) => `${name} = ${value}`).join(', ');
+    if (!law.twist) return gains;
     const factors = law.twist.map((value, k) => chain.command[k] / value).filter((_, k) => Math.abs(law.twist[k]) > 0.02);
     const limited = factors.length > 0 && Math.max(...factors) < 0.97 && Math.max(...factors) - Math.min(...factors) < 0.02;
     return limited ? `${gains}; the limits scale both by ${format(factors[0], 2)}` : gains;

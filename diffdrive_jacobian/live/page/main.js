@@ -76,6 +76,7 @@ function showPanels() {
   byId('chain').hidden = byId('legend').hidden = !robot;
   byId('truth').hidden = !robot?.truth;
   byId('planned').hidden = !robot?.goal.path;
+  byId('timed').hidden = !robot?.goal.reference;
   setText(byId('title'), model.bag || 'diffdrive_jacobian');
   setText(byId('notes'), model.notes.join('; '));
   byId('notes').title = model.notes.join('\n');

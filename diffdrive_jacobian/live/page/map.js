@@ -97,7 +97,7 @@ export class MapDrawing {
     if (!goals || (!active && state !== 'succeeded')) return;
     context.save();
     context.globalAlpha = selected ? 1 : 0.5;
-    if (robot.goal.path) this.drawPlanned(context, robot.goal.path, context.globalAlpha);
+    if (robot.goal.path) this.drawPlanned(context, robot.goal, context.globalAlpha);
     else if (active) {
       context.strokeStyle = colors.goal;
       context.setLineDash([5, 6]);
@@ -119,8 +119,8 @@ export class MapDrawing {
     context.restore();
   }
 
-  /** Draw the path that a robot is to drive along, wide and pale, below the one that it has driven. */
-  drawPlanned(context, points, alpha) {
+  /** Draw the path that a robot is to drive along, wide and pale, below the one that it has driven; and where its times are. */
+  drawPlanned(context, { path: points, reference }, alpha) {
     context.globalAlpha = 0.4 * alpha;
     context.strokeStyle = this.colors.goal;
     context.lineWidth = 7;
@@ -129,6 +129,11 @@ export class MapDrawing {
     for (const [x, y] of points) context.lineTo(...this.view.toScreen(x, y));
     context.stroke();
     context.globalAlpha = alpha;
+    if (!reference) return;
+    context.lineWidth = 2;
+    context.beginPath();
+    context.arc(...this.view.toScreen(reference[0], reference[1]), 7, 0, TAU);
+    context.stroke();
   }
 
   drawGoal(context, goal, { tolerance, heading, done, label }) {

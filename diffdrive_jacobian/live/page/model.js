@@ -1,13 +1,12 @@
 // What the page knows: the latest state of all robots, their paths and their histories.
 
-const CURVES = ['v', 'omega', 'command_v', 'command_omega', 'right', 'left', 'distance', 'bearing_error', 'goal_heading_error',
-  'across', 'path_heading_error'];
 const KEPT = 20;
 
+/** Quantities over time, of a robot or of a bag, by the names of `robot.now`. */
 class History {
   constructor() {
     this.time = [];
-    this.curves = Object.fromEntries(CURVES.map((name) => [name, []]));
+    this.curves = {};
     this.whole = false;
   }
 
@@ -15,8 +14,7 @@ class History {
   static recorded(strips) {
     const history = new History();
     history.whole = true;
-    history.time = strips.time;
-    for (const name of CURVES) history.curves[name] = strips[name] ?? strips.time.map(() => null);
+    ({ time: history.time, ...history.curves } = strips);
     return history;
   }
 
@@ -24,34 +22,20 @@ class History {
     const last = this.time.at(-1);
     if (last !== undefined && robot.time === last) return;
     if (last !== undefined && robot.time < last) this.clear();
-    const { chain } = robot;
-    const values = {
-      v: robot.twist[0],
-      omega: robot.twist[1],
-      command_v: robot.commanded ? chain.command[0] : null,
-      command_omega: robot.commanded ? chain.command[1] : null,
-      right: chain.wheels[0],
-      left: chain.wheels[1],
-      distance: robot.distance,
-      bearing_error: robot.bearing_error,
-      goal_heading_error: robot.goal_heading_error,
-      across: robot.across,
-      path_heading_error: robot.path_heading_error,
-    };
     this.time.push(robot.time);
-    for (const name of CURVES) this.curves[name].push(values[name]);
+    for (const [name, value] of Object.entries(robot.now)) (this.curves[name] ??= []).push(value);
     let late = 0;
     while (this.time[late] < robot.time - KEPT - 2) late += 1;
     // In blocks, because removing from the front costs as much as there is.
     if (late > 200) {
       this.time.splice(0, late);
-      for (const name of CURVES) this.curves[name].splice(0, late);
+      for (const curve of Object.values(this.curves)) curve.splice(0, late);
     }
   }
 
   clear() {
     this.time.length = 0;
-    for (const name of CURVES) this.curves[name].length = 0;
+    for (const curve of Object.values(this.curves)) curve.length = 0;
   }
 
   /** Return the interval of time to show. */

@@ -1,6 +1,6 @@
 // Sliders for the parameters of the nodes. A value that a node refuses goes back.
 
-import { byId, element, parseNumber, setText } from './dom.js';
+import { byId, element, math, parseNumber, setText } from './dom.js';
 
 const PERIOD = 120;
 const REST = 900;
@@ -44,7 +44,7 @@ export class Settings {
     for (const row of rows) {
       const node = this.create(row);
       if (row.group && !groups.has(row.group)) {
-        const open = rows.some((one) => one.group === row.group && one.value);
+        const open = rows.some((one) => one.group === row.group && one.used);
         groups.set(row.group, element('details', { open }, element('summary', {}, row.group)));
         nodes.push(groups.get(row.group));
       }
@@ -56,7 +56,7 @@ export class Settings {
 
   create(row) {
     const id = `setting-${row.key.replace(/\W/g, '-')}`;
-    const label = element('label', { htmlFor: id, title: row.hint }, row.label);
+    const label = element('label', { htmlFor: id, title: row.hint }, ...math(row.label));
     const controls = { choice: this.choice, flag: this.flag }[row.kind] ?? this.number;
     const { nodes, set } = controls.call(this, row, id);
     for (const node of nodes) node.disabled = this.model.recorded;
@@ -77,9 +77,9 @@ export class Settings {
   }
 
   number(row, id) {
-    const limit = row.kind === 'limit', step = (row.high - row.low) / 400;
+    const label = row.label.replace(/[_{}]/g, ''), limit = row.kind === 'limit', step = (row.high - row.low) / 400;
     const slider = element('input', { id, type: 'range', min: row.low, max: row.high, step, 'aria-description': row.hint });
-    const field = element('input', { type: 'text', inputMode: 'decimal', 'aria-label': `${row.label}, exact value${limit ? ', empty for none' : ''}`,
+    const field = element('input', { type: 'text', inputMode: 'decimal', 'aria-label': `${label}, exact value${limit ? ', empty for none' : ''}`,
       placeholder: limit ? 'none' : '' });
     const write = (value) => { field.value = value === null ? '' : plain(value); };
     slider.addEventListener('input', () => { write(Number(slider.value)); this.change(row, Number(slider.value), true); });
@@ -97,7 +97,7 @@ export class Settings {
       slider.value = value ?? row.high;
       write(value);
     };
-    return { nodes: [slider, field, element('span', { class: 'unit' }, row.unit)], set };
+    return { nodes: [slider, field, element('span', { class: 'unit' }, row.unit.replace('^2', '²'))], set };
   }
 
   /** Send a value; of many in a row not every one. */

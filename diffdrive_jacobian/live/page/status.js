@@ -18,16 +18,17 @@ function described(robot, recorded) {
   const [badge, kind] = robot.by_hand ? ['by hand', 'hand'] : STATES[goal.state] ?? STATES.unknown;
   if (age > 1) return ['silent', 'bad', `no odometry for ${format(age, 0)} s`];
   if (robot.by_hand) return [badge, kind, 'release to stop'];
+  const { distance, across, late } = robot.now;
   const truly = robot.true_distance === null ? '' : `, truly ${format(robot.true_distance)} m`;
-  if (goal.state === 'succeeded' && robot.distance !== null) return [badge, kind, `now ${format(robot.distance)} m from the goal${truly}`];
+  if (goal.state === 'succeeded' && distance !== null) return [badge, kind, `now ${format(distance)} m from the goal${truly}`];
   if (!goal.active) return [badge, kind, goal.state === 'unknown' && !recorded ? 'click on the map to send one' : ''];
   if (!goal.goals) return [badge, kind, 'the goal was sent before this page listened'];
   if (goal.path) {
-    const side = robot.across < 0 ? 'right' : 'left';
-    return [badge, kind, `${format(robot.distance)} m to go, ${format(Math.abs(robot.across) * 100, 1)} cm ${side} of the path`];
+    const side = across < 0 ? 'right' : 'left', behind = late > 0.05 ? `, ${format(late, 1)} s late` : '';
+    return [badge, kind, `${format(distance)} m to go, ${format(Math.abs(across) * 100, 1)} cm ${side} of the path${behind}`];
   }
   const many = goal.goals.length > 1 ? `waypoint ${goal.index + 1} of ${goal.goals.length}, ` : '';
-  return [badge, kind, `${many}${format(robot.distance)} m to go${truly}`];
+  return [badge, kind, `${many}${format(distance)} m to go${truly}`];
 }
 
 export function showStatus(model, open) {

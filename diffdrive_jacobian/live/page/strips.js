@@ -8,7 +8,7 @@ const STRIPS = [
   { name: 'wheels', unit: 'rad/s', digits: 1, curves: [['left', 'left', 'L'], ['right', 'right', 'R']] },
   { name: 'distance', unit: 'm', curves: [['distance', 'v', 'd']], ofPath: false },
   { name: 'bearing error', unit: 'rad', curves: [['goal_heading_error', 'muted', 'Δθ', true], ['bearing_error', 'omega', 'e']], ofPath: false },
-  { name: 'across path', unit: 'm', digits: 3, curves: [['across', 'v', 'left']], ofPath: true },
+  { name: 'off the path', unit: 'm', digits: 3, curves: [['along', 'muted', 'ahead', true], ['across', 'v', 'left']], ofPath: true },
   { name: 'heading to path', unit: 'rad', curves: [['path_heading_error', 'omega', 'Δθ']], ofPath: true },
 ];
 
@@ -54,7 +54,7 @@ export class Strips {
     const [from, to] = history.window(now), toX = (time) => GUTTER + ((time - from) / Math.max(to - from, 1e-9)) * (width - GUTTER);
     let low = 0, high = 0;
     for (const [name] of strip.curves) {
-      const curve = history.curves[name];
+      const curve = history.curves[name] ?? [];
       for (let k = 0; k < curve.length; k += 1) {
         if (curve[k] === null || history.time[k] < from) continue;
         low = Math.min(low, curve[k]);
@@ -80,7 +80,8 @@ export class Strips {
     }
     strip.curves.forEach(([name, color, label, dashed], number) => {
       const last = this.drawCurve(context, history, name, colors[color], dashed, { from, now, toX, toY });
-      setText(strip.values[number], `${label} ${format(last, strip.digits ?? 2)}`);
+      // A path without times has no curve along it.
+      setText(strip.values[number], last === null && dashed ? '' : `${label} ${format(last, strip.digits ?? 2)}`);
     });
     if (history.whole) {
       context.strokeStyle = colors.text;
@@ -93,7 +94,7 @@ export class Strips {
 
   /** Draw a curve; return its value now. */
   drawCurve(context, history, name, color, dashed, { from, now, toX, toY }) {
-    const curve = history.curves[name];
+    const curve = history.curves[name] ?? [];
     let pen = false, last = null;
     context.strokeStyle = color;
     context.lineWidth = dashed ? 1.2 : 1.8;
