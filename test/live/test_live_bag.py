@@ -12,6 +12,7 @@ from support.recorded import LockstepRecording
 from support.ros_messages import twist
 
 from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.control import line_path
 from diffdrive_jacobian.drives import drive
 from diffdrive_jacobian.live.bag_player import BagPlayer, RecordedRobot, read_robots
 from diffdrive_jacobian.live.commands import CancelGoal, Pause, Seek, SetSpeed, Step
@@ -135,6 +136,37 @@ def test_curves_and_parameters_of_the_whole_bag(player):
     trail = player.snapshot.trails['/']
     player.send(Seek(player.world['duration']))
     assert player.robot['travelled'] == len(trail.points)
+
+
+def test_a_trajectory_is_replayed_with_its_law_errors_and_times(tmp_path):
+    """Also what waits: the robot cannot keep the times."""
+    recording = Recording(tmp_path / 'along', lossless=True)
+    parameters = {'path_controller': 'kanayama', 'linear.x.max_velocity': 0.2}
+    drive(line_path(2.0).timed(0.8), lockstep=True, parameters=parameters, recording=recording)
+    recording.finish()
+    (robot,) = robots = read_robots(recording.bag)
+    line = robot.run.timeline()
+    received = int(robot.run.odometry.received[40])
+    change = (received, Changes('/go_to_goal', {'k_y': 7.0}, received))
+    changed = RecordedRobot('/', replace(robot.run, parameter_events=(change,)), robot.start)
+    player = Player(recording.bag, [changed])
+    late = []
+    for index in (5, 20, 60, 90):
+        player.send(Seek(float(robot.time[index]) + 1e-6))
+        now = player.robot['now']
+        for name in ('across', 'along', 'path_heading_error', 'late'):
+            assert now[name] == pytest.approx(getattr(line, name)[index], abs=1e-5), name
+        late.append(now['late'])
+        assert player.robot['goal']['reference'][0] == pytest.approx(0.8 * line.elapsed[index], abs=1e-5)
+        law = player.robot['law']
+        assert (law['name'], law['gains']['k_y']) == ('kanayama', 7.0 if index >= 40 else 25.0)
+        rows = {row['key']: row for row in player.snapshot.fixed['settings']['/']}
+        assert [*rows][:4] == [
+            f'controller/{one}' for one in ('k_x', 'k_y', 'k_theta', 'path_controller')
+        ]
+        assert rows['controller/k_y']['value'] == law['gains']['k_y']
+    assert late[0] == 0.0 < late[-1]
+    assert robots[0].strips()['late'][90] == pytest.approx(late[-1])
 
 
 def test_gains_of_another_package_are_shown_as_recorded(bag, robots):

@@ -224,6 +224,54 @@ def test_pause_step_and_waypoints(live):
     browser.until('document.getElementById("play").getAttribute("aria-label") === "Pause"')
 
 
+def test_on_a_path_its_law_drives_and_is_chosen_and_tuned(live, tmp_path):
+    """Each of the four laws by its choice, its formula and a slider that is dragged."""
+    laws = {
+        'kanayama': ('k_y', 'Kanayama 1990'),
+        'offset_point': ('k_point', 'B'),
+        'dynamic_feedback': ('k_position', 'Oriolo 2002'),
+        'pure_pursuit': ('lookahead_distance', 'Coulter 1992'),
+    }
+    arguments = ('--live', '--lockstep', '--no-record', '--no-browser', '--path', 'circle:2.0')
+    trajectory = ('--trajectory', '0.3', '--path-controller', 'kanayama')
+    browser = live.browser
+    with open_world(tmp_path) as world:
+        child = world.start('drive_to', *arguments, *trajectory)
+        child.until_says(r'page: http://\S+\n')
+        browser.open(re.search(r'page: (\S+)', child.stdout)[1])
+        browser.until('document.getElementById("state").innerText === "driving"')
+        choice = 'document.querySelector(\'[data-key="controller/path_controller"] select\')'
+        browser.evaluate(
+            f'globalThis.choose = (name) => {{ const one = {choice}; one.value = name;'
+            'one.dispatchEvent(new Event("change")); }'
+        )
+        for law, (gain, source) in laws.items():
+            browser.evaluate(f'choose({json.dumps(law)})')
+            sources = '[...document.querySelectorAll("#chain .source")].map((node) => node.innerText)'
+            browser.until(f'{sources}[1] === {json.dumps(source)}')
+            row = f'[data-key="controller/{gain}"]'
+            browser.until(f'document.querySelector({json.dumps(row)}).closest("details") === null')
+            # A second, so that no later state of the node is shown in between.
+            x, y = browser.center(f'{row} input[type=range]')
+            value = f'document.querySelector({json.dumps(row + " input[type=text]")}).value'
+            before = browser.evaluate(value)
+            browser.drag([x, y], [x + 12, y])
+            after = browser.evaluate(value)
+            assert after != before
+            # The chain shows what the node has.
+            browser.until(f'document.getElementById("chain").innerText.includes("= {after}")')
+            names = browser.evaluate('[...document.querySelectorAll(".strip:not([hidden]) .name")].map('
+                                     '(node) => node.innerText)')  # fmt: skip
+            assert names[-2:] == ['off the path m', 'heading to path rad']
+        assert 'm to go' in browser.text('#summary')
+        assert browser.evaluate('document.getElementById("timed").hidden') is False
+        assert browser.errors == []
+        child.signal(signal.SIGINT)
+        assert child.exit() == 0
+    browser.open(live.url)
+    browser.until('document.querySelector("#sliders input") !== null')
+
+
 def test_nothing_is_clipped_or_covered_on_usual_screens(live):
     browser = live.browser
     ground = 'getComputedStyle(document.body).backgroundColor'

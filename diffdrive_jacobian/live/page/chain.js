@@ -1,6 +1,6 @@
 // The chain of matrices from the goal to the velocity in the world, with live numbers.
 
-import { element, format, math, setMath, setText } from './dom.js';
+import { element, format, math, plain, setMath, setText } from './dom.js';
 
 const LAWS = {
   go_to_goal: ['v = K_v d cos e,  ω = K_p e', 'A (9)–(11)'],
@@ -112,7 +112,7 @@ export class Chain {
   describe(robot) {
     const { law, chain } = robot;
     if (robot.by_hand || !robot.commanded) return '';
-    const gains = Object.entries(law.gains).map(([name, value]) => `${name} = ${value}`).join(', ');
+    const gains = Object.entries(law.gains).map(([name, value]) => `${name} = ${value === null ? '–' : plain(value)}`).join(', ');
     if (!law.twist) return gains;
     const factors = law.twist.map((value, k) => chain.command[k] / value).filter((_, k) => Math.abs(law.twist[k]) > 0.02);
     const limited = factors.length > 0 && Math.max(...factors) < 0.97 && Math.max(...factors) - Math.min(...factors) < 0.02;

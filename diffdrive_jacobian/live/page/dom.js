@@ -32,6 +32,12 @@ export function setMath(node, text) {
   node.replaceChildren(...math(text));
 }
 
+/** Return a number as a person would type it. */
+export function plain(value) {
+  const small = value !== 0 && Math.abs(value) < 1e-3;
+  return small ? value.toExponential(2).replace(/\.?0+e/, 'e') : String(Number(value.toPrecision(4)));
+}
+
 /** Return a number as text with a true minus sign; a dash if there is none. */
 export function format(value, digits = 3) {
   if (value === null || value === undefined || !Number.isFinite(value)) return '–';

@@ -1,15 +1,9 @@
 // Sliders for the parameters of the nodes. A value that a node refuses goes back.
 
-import { byId, element, math, parseNumber, setText } from './dom.js';
+import { byId, element, math, parseNumber, plain, setText } from './dom.js';
 
 const PERIOD = 120;
 const REST = 900;
-
-/** Return a number as a person would type it. */
-function plain(value) {
-  const small = value !== 0 && Math.abs(value) < 1e-3;
-  return small ? value.toExponential(2).replace(/\.?0+e/, 'e') : String(Number(value.toPrecision(4)));
-}
 
 export class Settings {
   constructor(model, send) {
