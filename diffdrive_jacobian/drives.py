@@ -245,11 +245,7 @@ def drive(
                 else in_real_time(ros_arguments, isolated=isolated)
             )
         context = runner.context
-        of_robot = overrides({**(robot_parameters or {}), 'command_interface': 'wheels'})
-        robot = runner.add(lambda: VirtualRobot(context=context, parameter_overrides=of_robot))
-        bridge = runner.add(lambda: WheelBridge(context=context))
-        of_controller = overrides(parameters or {})
-        controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=of_controller))
+        robot, bridge, controller = add_nodes(runner, parameters or {}, robot_parameters or {})
         client = runner.add(lambda: GoalClient(NAME, sent, context, relative=relative))
         client.arrival = controller.arrival
         speeds = (0.0, 0.0)
@@ -317,6 +313,25 @@ def drive(
             offset=controller.arrival.offset,
             seconds=seconds,
         )
+
+
+def add_nodes(
+    runner: NodeRunner, parameters: Mapping[str, Any], robot_parameters: Mapping[str, Any]
+) -> tuple[VirtualRobot, WheelBridge, GoToGoal]:
+    """Add a robot that is driven by its wheels, the bridge and the controller to a runner.
+
+    Args:
+        runner: Runs the nodes.
+        parameters: Parameters of go_to_goal, by name.
+        robot_parameters: Likewise of virtual_robot.
+    """
+    of_robot = overrides({**robot_parameters, 'command_interface': 'wheels'})
+    of_controller, how = overrides(parameters), {'context': runner.context}
+    return (
+        runner.add(lambda: VirtualRobot(**how, parameter_overrides=of_robot)),
+        runner.add(lambda: WheelBridge(**how)),
+        runner.add(lambda: GoToGoal(**how, parameter_overrides=of_controller)),
+    )
 
 
 def overrides(parameters: Mapping[str, Any]) -> list[Parameter]:

@@ -16,7 +16,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from diffdrive_jacobian.control import Path
-from diffdrive_jacobian.drives import in_lockstep, in_real_time, overrides, recorder_of
+from diffdrive_jacobian.drives import add_nodes, in_lockstep, in_real_time, recorder_of
 from diffdrive_jacobian.live.commands import Command, Pause, RobotCommand, SetSpeed, Step
 from diffdrive_jacobian.live.live_robot import LiveRobot
 from diffdrive_jacobian.live.robot_state import GoalEnd
@@ -26,9 +26,6 @@ from diffdrive_jacobian.lockstep.runner import LockstepRunner
 from diffdrive_jacobian.messages.codecs import PARAMETER_EVENT, Changes
 from diffdrive_jacobian.messages.names import base_name, full_name, is_named, namespace_of, node_of
 from diffdrive_jacobian.messages.topics import PARAMETER_EVENTS, TOPICS
-from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.ros.runner import ros_context, running
@@ -344,13 +341,7 @@ def drive_live(
         ready(server)
         runner = stack.enter_context(stage)
         context = runner.context
-        of_robot = overrides({**robot_parameters, 'command_interface': 'wheels'})
-        of_controller = overrides(parameters)
-        nodes: list[Node] = [
-            runner.add(lambda: VirtualRobot(context=context, parameter_overrides=of_robot)),
-            runner.add(lambda: WheelBridge(context=context)),
-            runner.add(lambda: GoToGoal(context=context, parameter_overrides=of_controller)),
-        ]
+        nodes = add_nodes(runner, parameters, robot_parameters)
         nodes_created([node.get_fully_qualified_name() for node in nodes])
         pacing = Pacing() if lockstep else None
         # The executor of nodes that others can reach leaves the topics to `work`.

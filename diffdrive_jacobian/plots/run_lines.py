@@ -1,4 +1,4 @@
-"""The lines of a run that are drawn: measured, commanded, and limits, each of bounded length."""
+"""The lines of a run that are drawn: measured, commanded, and limits."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from diffdrive_jacobian.bags.run import Series, number
-from diffdrive_jacobian.bags.timeline import Array, Indices, Mask, Timeline, seconds
+from diffdrive_jacobian.bags.timeline import Array, Indices, Timeline, seconds
 
-BUCKETS = 1500
-"""A longer line is reduced to the minimum and the maximum of so many parts."""
 _TWIST = {'v': 0, 'omega': 1}
 _WHEEL = {'right': 0, 'left': 1}
 _BODY = ('virtual_robot', 'go_to_goal')
@@ -89,26 +87,5 @@ def _back_in_time(rows: Array) -> Indices:
 
 
 def line(rows: Array, breaks: Indices) -> Array:
-    """Return a line that is broken before some of its rows and reduced if it is long.
-
-    Of each part of a long line, the rows with the minimum and the maximum of each column remain.
-    """
-    rows = np.where(np.isfinite(rows), rows, np.nan)
-    rows = np.insert(rows, breaks, np.nan, axis=0)
-    count, width = rows.shape
-    if count <= 2 * width * BUCKETS:
-        return rows
-    holes: Mask = np.any(np.isnan(rows), axis=1)
-    gaps = np.flatnonzero(holes[1:] & ~holes[:-1]) + 1
-    # With more gaps only dots would remain.
-    keep = [np.array([0, count - 1]), gaps[: len(gaps) * (len(gaps) <= BUCKETS // 10)]]
-    size = -(-count // BUCKETS)
-    starts = np.arange(0, count, size)
-    for column in rows.T:
-        for sign in (1.0, -1.0):
-            # Rows with NaN count as the greatest.
-            padded = np.full(len(starts) * size, np.inf)
-            padded[:count] = np.where(np.isnan(column), np.inf, sign * column)
-            keep.append(starts + padded.reshape(-1, size).argmin(axis=1))
-    kept: Array = rows[np.unique(np.concatenate(keep))]
-    return kept if len(gaps) <= BUCKETS // 10 else kept[~np.isnan(kept).any(axis=1)]
+    """Return a line that is broken before some of its rows, and where it is not finite."""
+    return np.insert(np.where(np.isfinite(rows), rows, np.nan), breaks, np.nan, axis=0)

@@ -129,9 +129,20 @@ def counted(number: int, noun: str) -> str:
     return f'{number} {noun}' if number == 1 else f'{number} {noun}s'
 
 
-def deviation(metres: float) -> str:
-    """Return a distance from a path, which may be a fraction of a millimetre."""
-    return f'{1e3 * metres:.2f} mm' if metres < 0.1 else f'{metres:.3f} m'
+def where_on_path(distance: float, across: float, late: float, *, arrived: bool) -> str:
+    """Return where a robot is on its path in words: before its end, or from it if it has arrived.
+
+    Args:
+        distance: What remains, or the distance from the end (m).
+        across: Greatest distance from the path (m). NaN: not known.
+        late: How much later than by its times it arrived (s). NaN: there are none.
+        arrived: Whether it did.
+    """
+    text = f'{distance:.3f} m {"from" if arrived else "before"} the end of the path'
+    if not math.isnan(across):
+        off = f'{1e3 * across:.2f} mm' if across < 0.1 else f'{across:.3f} m'
+        text += f', at most {off} from it'
+    return text if math.isnan(late) else f'{text}, {late:.1f} s later than by its times'
 
 
 def describe_bag(bag: Path, summary: Summary, state: str = 'complete') -> str:

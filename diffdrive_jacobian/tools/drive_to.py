@@ -224,12 +224,8 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
         simulated = ' of simulated time' if options.lockstep else ''
         distances = _describe_distances(outcome.distance, outcome.true_distance) + point
         if options.path is not None:
-            side = 'from' if outcome.arrived else 'before'
-            distances = f'{outcome.distance:.3f} m {side} the end of the path'
-            if not math.isnan(outcome.across):
-                distances += f', after at most {_output.deviation(outcome.across)} from it'
-            if not math.isnan(outcome.late):
-                distances += f', {outcome.late:.1f} s later than by its times'
+            place = outcome.distance, outcome.across, outcome.late
+            distances = _output.where_on_path(*place, arrived=outcome.arrived)
             if not math.isnan(outcome.true_distance):
                 distances += f' by odometry, truly {outcome.true_distance:.3f} m from its end'
         did = 'still moved' if outcome.moving else 'stopped'

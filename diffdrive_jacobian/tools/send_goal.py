@@ -114,11 +114,10 @@ def report(result: GoalResult, options: argparse.Namespace, what: str) -> list[s
 
     where = ''
     if result.across is not None:
-        side = 'from' if result.arrived else 'before'
-        across = _output.deviation(result.across)
-        where = f', {result.distance:.3f} m {side} the end, at most {across} from the path'
-        if result.late is not None:
-            where += f', {result.late:.1f} s later than by its times'
+        late = math.nan if result.late is None else result.late
+        assert result.distance is not None
+        place = result.distance, result.across, late
+        where = f', {_output.where_on_path(*place, arrived=result.arrived)}'
     elif result.distance is not None and not result.topic.endswith('path'):
         where = f', {result.distance:.3f} m from the goal'
     reasons = {

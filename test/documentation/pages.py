@@ -453,7 +453,7 @@ def write_pictures() -> None:
     from PIL import Image
 
     from diffdrive_jacobian import plots
-    from diffdrive_jacobian.plots.rendering import render, styled
+    from diffdrive_jacobian.plots.rendering import render
 
     shown = {
         Path(link)
@@ -462,8 +462,7 @@ def write_pictures() -> None:
     }
     for name in plots.PICTURES:
         if (file := Path('../resource/pictures') / f'{name}.png') in shown:
-            with styled():
-                content = render(getattr(plots, name)(), 'png')
+            content = render(getattr(plots, name)(), 'png')
             picture = Image.open(io.BytesIO(content)).convert('RGB').quantize(dither=Image.Dither.NONE)
             picture.save(ROOT / 'doc' / file, optimize=True)
 

@@ -44,13 +44,15 @@ def run(*arguments):
 def test_a_picture_is_whole_and_does_not_depend_on_the_style_of_the_user(name):
     with matplotlib.rc_context({'text.usetex': True, 'font.size': 40.0, 'lines.linewidth': 20.0}):
         drawn = getattr(plots, name)()
-    with rendering.styled():
-        content = rendering.render(drawn, 'png')
-        # The style of all is set by the same decorator.
-        assert hasattr(getattr(plots, name), '__wrapped__')
-        if name == 'geometry':
-            assert rendering.render(plots.geometry(), 'png') == content
+    content = rendering.render(drawn, 'png')
+    # The style of all is set by the same decorator.
+    assert hasattr(getattr(plots, name), '__wrapped__')
+    if name == 'geometry':
+        assert rendering.render(plots.geometry(), 'png') == content
     assert len(content) < LARGEST
+    # At its own resolution again.
+    with rendering.styled():
+        drawn.draw_without_rendering()
     texts = {one for one in drawn.findobj(Text) if one.get_visible() and one.get_text().strip()}
     boxes = {one: one.get_window_extent() for one in texts.difference(hidden(drawn))}
     assert boxes

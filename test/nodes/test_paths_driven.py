@@ -99,7 +99,7 @@ def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
     bag = tmp_path / 'circle'
     arguments = ['--path', 'circle:0.15', '--speed', '0.4', '--lockstep', '-o', str(bag), '--no-plot']
     assert main(arguments, Signals()) == 0
-    assert 'm from the end of the path, after at most 0.00' in capsys.readouterr().out
+    assert 'm from the end of the path, at most 0.00' in capsys.readouterr().out
     one = timeline(read_run(bag))
     ((planned,), series) = one.paths, one.run.odometry.values
     assert planned.length == pytest.approx(0.3 * math.pi, rel=1e-3)

@@ -12,7 +12,7 @@ from support.runs import RATE, STRAIGHT, drive
 
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.timeline import seconds, timeline
-from diffdrive_jacobian.plots.run_lines import BUCKETS, limits, line
+from diffdrive_jacobian.plots.run_lines import limits
 
 CONTROLLER = {'controller': 'go_to_goal', 'use_goal_heading': False, 'xy_goal_tolerance': 0.05}
 TOPICS = {
@@ -218,29 +218,3 @@ def test_limits_are_the_narrowest_of_the_nodes_from_when_they_were_set(tmp_path)
     assert found['right'][1] == pytest.approx(changes, abs=1e-9)
     run = run_of(tmp_path, odometry(count=9), 'unlimited', virtual_robot=unlimited)
     assert all(np.isnan(bounds[..., 1]).all() for bounds in limits(timeline(run)).values())
-
-
-# --- Long lines
-
-
-def test_a_long_line_keeps_its_extremes_and_its_ends():
-    rng = np.random.default_rng(1)
-    rows = np.column_stack([np.arange(100_000.0), rng.normal(size=100_000)])
-    rows[77_777, 1], rows[33, 1] = 50.0, -50.0
-    kept = line(rows, np.array([50_000]))
-    assert len(kept) < 4 * BUCKETS + 4
-    assert {33.0, 77_777.0, 0.0, 99_999.0} <= set(kept[:, 0])
-    assert np.isnan(kept[:, 1]).sum() == 1
-    assert (np.diff(kept[~np.isnan(kept[:, 0]), 0]) > 0).all()
-    assert line(rows[:1000], np.array([], dtype=int)).tolist() == rows[:1000].tolist()
-
-
-def test_a_long_line_with_very_many_gaps_is_drawn_without_them():
-    count = 100_000
-    rows = np.column_stack([np.arange(count), np.sin(np.arange(count))])
-    kept = line(rows, np.arange(10, count, 10))
-    assert np.isfinite(kept).all()
-    assert len(kept) < count / 5
-    np.testing.assert_allclose(
-        [kept.min(axis=0), kept.max(axis=0)], [rows.min(axis=0), rows.max(axis=0)]
-    )
