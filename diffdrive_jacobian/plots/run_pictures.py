@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import os
 import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from diffdrive_jacobian.bags.summary import Summary, summary
 from diffdrive_jacobian.bags.timeline import Timeline, timeline
 from diffdrive_jacobian.plots import run_panels
 from diffdrive_jacobian.plots.rendering import picture
+from diffdrive_jacobian.plots.run_layout import Texts, arrange, lay_out
 from diffdrive_jacobian.plots.run_lines import commanded
 from diffdrive_jacobian.plots.run_panels import COMMAND, GREY, HEADING, LABELS, LIMIT, ViolationMark
 from diffdrive_jacobian.plots.run_plane import COLOR, PLANNED, TRUTH, Plane, extent
@@ -27,28 +27,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH = 11.0
-"""Width of the figure. All sizes below are inches, too."""
-PLANE_WIDTH, PLANE_LEAST = 5.0, 2.4
-"""Width of the plane beside the panels, at most and at least."""
-WIDE, WIDE_HEIGHT = 1.6, 3.4
-"""The plane is above the panels if it is so many times wider than high; its height is then at most."""
-WIDE_WIDTH = 6.9
-PANEL_HEIGHT, LEAST_HEIGHT = 1.25, 4.2
-"""Height of a panel over time, and the least one of all in a column."""
-TICKS, TITLE, AXIS, EDGE = 0.62, 0.34, 0.5, 0.12
-"""Room for tick labels left of axes, for a title above, for tick labels and the label below, and at the
-edge of the figure."""
-LINE = 0.2
-"""Height of a line of text in the header and in legends."""
-RUNS = 10
-"""Number of runs beyond which the lines of the header shrink."""
 LABEL = 40
 """Length beyond which the name of a bag is shortened in the middle."""
 NOTED, NOTE_WIDTH = 4, 150
 """Number of lines of notes below the figure, and of characters in a line."""
-LETTER = 0.066
-"""Width of a letter in a legend."""
 COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 """The colors of Okabe and Ito that contrast with white. The line styles differ between runs as well."""
 STYLES: tuple[Any, ...] = ('-', (0, (5, 1.5)), '-.', (0, (1.2, 1)), (0, (7, 1.5, 1, 1.5, 1, 1.5)))
@@ -70,19 +52,20 @@ def run_figure(runs: Run | Sequence[Run], violations: Sequence[ViolationMark] = 
         ModuleNotFoundError: matplotlib is not installed.
     """
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
     runs = [runs] if isinstance(runs, Run) else runs
     timelines = [timeline(run) for run in runs]
     alone = timelines[0] if len(runs) == 1 else None
     uncertain = [] if alone is None else uncertainties(alone)
     bounds = extent(timelines, [one.extent for one in uncertain])
-    # Everything is drawn first into axes of a wrong size: what is drawn decides about the legend.
-    drawing = Figure(figsize=(WIDTH, WIDTH))
-    axes = drawing.add_axes((0.0, 0.0, 1.0, 1.0), label='plane')
     names = run_panels.quantities(timelines)
-    panels = {name: drawing.add_axes((0.0, 0.0, 1.0, 1.0), label=name) for name in names}
-    layout = _Layout.of(bounds, len(panels))
-    plane = Plane(axes, bounds, layout.plane_width, timelines)
+    arrangement = arrange(bounds, len(names))
+    # The axes get their places at the end: what is drawn decides how much text is around them.
+    drawing = Figure()
+    axes, *others = (drawing.add_axes((0.0, 0.0, 1.0, 1.0), label=name) for name in ('plane', *names))
+    panels = dict(zip(names, others, strict=True))
+    plane = Plane(axes, bounds, arrangement.plane_width, timelines)
     if alone is not None:
         draw_uncertainty(axes, uncertain)
     limited = False
@@ -104,7 +87,12 @@ def run_figure(runs: Run | Sequence[Run], violations: Sequence[ViolationMark] = 
     _finish(panels, timelines)
     labels = names_of([run.path for run in runs])
     header, entries = _header(labels, [summary(one) for one in timelines])
-    layout.place(drawing, axes, [*panels.values()], header, entries, styles, marks, _notes(runs, labels))
+    samples = [
+        Line2D([], [], color=color, ls=style, lw=1.8, label=entry)
+        for entry, (_, color, style) in zip(entries, styles, strict=False)
+    ]
+    texts = Texts(header, samples, marks, _notes(runs, labels))
+    lay_out(drawing, axes, others, arrangement, texts, _time_label(timelines))
     return drawing
 
 
@@ -165,6 +153,13 @@ def _notes(runs: Sequence[Run], labels: Sequence[str]) -> list[str]:
     return [part for one in lines for part in textwrap.wrap(one, NOTE_WIDTH)]
 
 
+def _time_label(timelines: Sequence[Timeline]) -> str:
+    if any(np.isnan(one.start) for one in timelines):
+        return 'time [s]'
+    goals = any(len(one.run.goals) for one in timelines)
+    return f'time since the first {"goal" if goals else "path"} [s]'
+
+
 def _finish(panels: dict[str, Axes], timelines: Sequence[Timeline]) -> None:
     """Set titles and limits of the panels. The wheels share their scale."""
     first, last = run_panels.window(timelines)
@@ -215,115 +210,3 @@ def _marks(timelines: Sequence[Timeline], plane: Plane, *, limited: bool) -> lis
     if alone and len(run_panels.goal_changes(timelines[0])):
         mark('a goal begins or ends', ls=':', lw=0.9, color=GREY)
     return marks
-
-
-class _Layout(NamedTuple):
-    """Where everything is (inches). Text has its room, so that nothing overlaps."""
-
-    above: bool
-    """Whether the plane is above the panels, not beside them."""
-    plane_width: float
-    plane_height: float
-    rows: int
-    columns: int
-
-    @classmethod
-    def of(cls, bounds: Any, count: int) -> _Layout:
-        """Return the layout for what the plane shows (m) and a number of panels."""
-        width, height = (bounds[1] - bounds[0]).tolist()
-        aspect = width / height
-        if aspect > WIDE:
-            columns = 2 if count in (2, 4) else 3
-            wide = min(WIDE_WIDTH, WIDE_HEIGHT * aspect)
-            return cls(True, wide, wide / aspect, math.ceil(count / columns), columns)
-        columns = 1 if count == 2 else 2
-        rows = math.ceil(count / columns)
-        room = max(rows * (PANEL_HEIGHT + TITLE), LEAST_HEIGHT) - TITLE
-        wide = min(max(room * aspect, PLANE_LEAST), PLANE_WIDTH)
-        tall = min(room, wide / aspect)
-        return cls(False, tall * aspect, tall, rows, columns)
-
-    def place(
-        self,
-        drawing: Figure,
-        plane: Axes,
-        panels: Sequence[Axes],
-        header: Sequence[str],
-        entries: Sequence[str],
-        styles: Sequence[tuple[Timeline, str, Any]],
-        marks: Sequence[Any],
-        notes: Sequence[str],
-    ) -> None:
-        """Give the figure its size, the axes their places, and write the texts around them."""
-        from matplotlib.lines import Line2D
-
-        column_left = EDGE + TICKS + max(self.plane_width, PLANE_LEAST) + 0.25
-        line = LINE * min(1.0, RUNS / max(len(entries), 1))
-        top = EDGE + LINE * 1.3 * len(header) + line * len(entries) + (0.1 if header or entries else 0.0)
-        longest = max(len(one.get_label().split('\n')[0]) for one in marks)
-        lines = sum(one.get_label().count('\n') + 1 for one in marks)
-        tall = LINE * lines + 0.1
-        if self.above:
-            beside = tall <= self.plane_height + AXIS
-            panels_top = top + max(self.plane_height + AXIS, tall * beside) + TITLE
-            left, rows_height = EDGE, self.rows * (PANEL_HEIGHT + TITLE)
-        else:
-            rows_height = max(self.rows * (PANEL_HEIGHT + TITLE), LEAST_HEIGHT)
-            beside = tall <= rows_height - TITLE - self.plane_height - 0.1
-            panels_top, left = top + TITLE, column_left
-        bottom = panels_top + rows_height - TITLE + AXIS
-        across = max(1, min(len(marks), int((WIDTH - 2 * EDGE) / (0.55 + LETTER * longest))))
-        height = bottom + EDGE + LINE * 0.85 * len(notes)
-        if not beside:
-            height += LINE * math.ceil(lines / across) + 0.15
-        drawing.set_size_inches(WIDTH, height)
-
-        def place(axes: Axes, x: float, y: float, width: float, tall: float) -> None:
-            axes.set_position((x / WIDTH, 1.0 - (y + tall) / height, width / WIDTH, tall / height))
-
-        plane_top = top if self.above else panels_top
-        place(plane, EDGE + TICKS, plane_top, self.plane_width, self.plane_height)
-        since = ''
-        if all(not np.isnan(one.start) for one, _, _ in styles):
-            goals = any(len(one.run.goals) for one, _, _ in styles)
-            since = f' since the first {"goal" if goals else "path"}'
-        step = (WIDTH - EDGE - left) / self.columns
-        row_height = rows_height / self.rows
-        for index, panel in enumerate(panels):
-            row, column = divmod(index, self.columns)
-            x, y = left + column * step + TICKS, panels_top + row * row_height
-            place(panel, x, y, step - TICKS - 0.08, row_height - TITLE)
-            last = index + self.columns >= len(panels)
-            panel.tick_params(labelbottom=last)
-            panel.set_xlabel(f'time{since} [s]' if last else '')
-
-        def write(x: float, y: float, text: str, **style: Any) -> None:
-            drawing.text(x / WIDTH, 1.0 - y / height, text, va='top', **style)
-
-        for index, text in enumerate(header):
-            size = 12.0 if index == 0 and not entries else 10.0
-            write(EDGE + 0.1, EDGE + LINE * 1.3 * index, text, fontsize=size)
-        for index, (text, (_, color, style)) in enumerate(zip(entries, styles, strict=False)):
-            y = EDGE + LINE * 1.3 * len(header) + line * index
-            at = 1.0 - (y + 0.45 * line) / height
-            ends = [(EDGE + 0.1) / WIDTH, (EDGE + 0.55) / WIDTH]
-            drawing.add_artist(Line2D(ends, [at, at], color=color, ls=style, lw=1.8))
-            write(EDGE + 0.65, y, text, fontsize=min(9.5, 48.0 * line))
-        where: tuple[float, float] = (EDGE, bottom + 0.1)
-        if beside and self.above:
-            where = (column_left, top)
-        elif beside:
-            where = (EDGE + TICKS - 0.1, plane_top + self.plane_height + AXIS)
-        drawing.legend(
-            handles=marks,
-            loc='upper left',
-            bbox_to_anchor=(where[0] / WIDTH, 1.0 - where[1] / height),
-            ncol=1 if beside else across,
-            fontsize=9.0,
-            borderaxespad=0.0,
-            borderpad=0.0,
-            labelspacing=0.45,
-        )
-        for index, text in enumerate(notes):
-            y = height - EDGE - LINE * 0.85 * (len(notes) - index)
-            write(EDGE + 0.1, y, text, fontsize=8.0, color=GREY)

@@ -143,10 +143,10 @@ def test_limits_are_drawn_where_they_are_near(run):
 
 def test_runs_differ_by_colour_and_by_style_and_have_no_commands(run):
     made = run_figure([replace(run, path=Path(name)) for name in 'abc'])
-    assert [one[:3] for one in written(made) if 'not arrived' in one] == ['a: ', 'b: ', 'c: ']
-    # The samples beside the names.
-    assert len({one.get_color() for one in made.artists}) == 3
-    assert len({one.get_linestyle() for one in made.artists}) == 3
+    named = made.legends[0]
+    assert [one.get_text()[:3] for one in named.get_texts()] == ['a: ', 'b: ', 'c: ']
+    assert len({one.get_color() for one in named.get_lines()}) == 3
+    assert len({one.get_linestyle() for one in named.get_lines()}) == 3
     # One for each run, zero, and the limit that is near, for each.
     assert len(by_label(made)[LABELS['v']].lines) == 3 + 3 + 3
     assert commanded(made) == []
@@ -157,12 +157,16 @@ def test_gains_that_differ_stand_beside_the_runs_and_the_others_in_the_title(run
         values = {'controller': controller, 'kp': kp, 'kv': 0.5}
         return replace(run, path=Path(name), parameters={'/go_to_goal': values})
 
-    title, a, b = written(run_figure([driven('a', 1.0), driven('b', 2.0)]))
+    def lines(*runs):
+        made = run_figure([*runs])
+        return [*written(made), *(one.get_text() for one in made.legends[0].get_texts())]
+
+    title, a, b = lines(driven('a', 1.0), driven('b', 2.0))
     assert title == 'control law go_to_goal: kv = 0.5 1/s'
     assert [a.rpartition('; ')[2], b.rpartition('; ')[2]] == ['kp = 1 1/s', 'kp = 2 1/s']
     _, title = written(run_figure(driven('a', 1.0)))
     assert title == 'control law go_to_goal: kp = 1 1/s, kv = 0.5 1/s'
-    a, b = written(run_figure([driven('a', 1.0), driven('b', 1.0, 'pose')]))
+    a, b = lines(driven('a', 1.0), driven('b', 1.0, 'pose'))
     assert a.endswith('; go_to_goal: kp = 1 1/s, kv = 0.5 1/s')
     assert b.endswith('; pose: kp = 1 1/s, kv = 0.5 1/s')
 
@@ -202,7 +206,7 @@ def test_without_goals_wheels_and_limits_these_are_left_out(tmp_path):
     # More runs than there are styles.
     made = run_figure([replace(plain, path=Path(f'run_{index}')) for index in range(7)])
     assert set(by_label(made)) == {LABELS['v'], LABELS['omega']}
-    assert legends(made) == ['start', 'end']
+    assert legends(made)[7:] == ['start', 'end']
     assert by_label(made)[LABELS['omega']].get_xlabel() == 'time [s]'
 
 
