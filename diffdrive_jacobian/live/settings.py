@@ -128,12 +128,12 @@ SETTINGS = [replace(one, declared=_DECLARED[one.role][one.name].limits) for one 
 
 
 @lru_cache(maxsize=16)
-def _installed(registry: Controllers[Any], name: str) -> tuple[Gain, ...] | None:
-    """Return the gains of a law that is installed here; None: it is not."""
+def _installed(registry: Controllers[Any], name: str) -> tuple[Gain, ...]:
+    """Return the gains of a law that is installed here; of another one they are unknown."""
     try:
         return tuple(registry.find(name).gains)
     except ControllerError:
-        return None
+        return ()
 
 
 def gains(values: Values, *, path: bool, imported: bool) -> tuple[Gain, ...]:
@@ -144,7 +144,7 @@ def gains(values: Values, *, path: bool, imported: bool) -> tuple[Gain, ...]:
     registry = ALL_PATH_CONTROLLERS if path else CONTROLLERS
     chosen = chosen_law(values, path=path)
     if chosen.law is None and chosen.name and imported:
-        return _installed(registry, chosen.name) or chosen.gains
+        return _installed(registry, chosen.name)
     return chosen.gains
 
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from diffdrive_jacobian.errors import DiffdriveError, InterruptionError, NotDoneError, UserError
-from diffdrive_jacobian.plots.output_files import cannot_write, create
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools.entry_points import FAILED, INTERRUPTED, OUTPUT_ERROR, USER_ERROR
@@ -107,6 +106,9 @@ def write(path: Path, content: bytes, *, replace: bool) -> None:
     Raises:
         NotDoneError: It cannot be written.
     """
+    # Not above: nodes need none of it.
+    from diffdrive_jacobian.plots.output_files import cannot_write, create
+
     try:
         create(path, content, replace=replace)
     except OSError as error:

@@ -31,7 +31,8 @@ class Site:
         monkeypatch.syspath_prepend(str(path))
         for known in (CONTROLLERS, ALL_PATH_CONTROLLERS):
             monkeypatch.setattr(known, '_known', dict(known.built_in))
-        settings.gains.cache_clear()
+        settings._installed.cache_clear()
+        settings._names.cache_clear()
 
     def install(self, name, source=None, *, package=None, version='1.2'):
         """Install a package that provides a controller; return the name of its module.

@@ -147,11 +147,12 @@ def test_help_and_the_page_describe_the_gains_of_the_controller_that_is_chosen(s
     assert 'Gain on the bearing [1/s]. Must be in [0, 20]' in of_node.out
     assert '--k_alpha' in commands.run('sweep_gains', '--controller', 'polar', '--help').out
     values = {'controller': {'controller': 'polar', 'k_rho': 0.5, 'k_alpha': 2.0, 'kp': 3.0}}
-    rows = {row['key']: row for row in settings.shown(values, settings.gains('polar'))}
+    how = {'path': False, 'imported': True}
+    rows = {row['key']: row for row in settings.shown(values, **how)}
     assert rows['controller/k_alpha']['hint'] == 'Gain on the bearing'
     assert (rows['controller/k_alpha']['low'], rows['controller/k_alpha']['high']) == (0.2, 6.0)
     assert 'controller/kp' not in rows
-    assert settings.gains('of another machine') == ()
+    assert settings.gains({'controller': 'of another machine', 'k_rho': 0.5}, **how) == ()
 
 
 # --- Sweeps
