@@ -7,19 +7,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffdrive_jacobian.bags.timeline import Array, Indices, Timeline
+from diffdrive_jacobian.bags.timeline import Array, Indices, Timeline, on_axis
 from diffdrive_jacobian.parameters.chosen_law import chosen_law
 from diffdrive_jacobian.text import printable
 
+ROUNDING = 1e-6
+"""Tolerance of times (s)."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Summary:
+class RunSummary:
     """A run. Greatest values are absolute ones; NaN: there is none."""
 
     outcome: str
-    """Of the last goal or path: `arrived`, `canceled`, `aborted` or `not arrived`; `no goal`."""
+    """Of the last goal or path: `arrived`, `canceled`, `aborted` or `not arrived`. `refused`: all were.
+    `no goal`: there was none."""
     seconds: float
-    """From the first goal to the end of the last one; without goals, or an end, of the whole run (s)."""
+    """From the first goal or path to the end of the last one, or of the run (s). All is of this time."""
     length: float
     """Distance travelled (m)."""
     distance: float
@@ -37,40 +41,48 @@ class Summary:
     law: str
     """Control law of the last goal or path; '': not known."""
     gains: Mapping[str, str]
-    """Its gains with their units, by name; several values in order if they were changed."""
+    """Its gains with their units, by name; the first and the last value of those that were changed."""
 
     @property
     def described(self) -> str:
         """What became of the goals and when, and the distance travelled."""
         when = 'within' if self.outcome == 'not arrived' else 'after'
         outcome = '' if self.outcome == 'no goal' else f'{self.outcome} {when} '
+        outcome = 'refused, ' if self.outcome == 'refused' else outcome
         return f'{outcome}{self.seconds:.1f} s, {self.length:.2f} m'
 
 
-def summary(one: Timeline) -> Summary:
-    """Summarise a run."""
-    goals = not np.isnan(one.start)
-    start = one.start if goals else one.time[0]
-    end = one.time[-1] if np.isnan(one.end) else one.end
-    odometry = one.run.odometry.values
-    law, gains = _law(one)
-    outcome = one.outcome.word if one.outcome.ended else 'not arrived' if goals else 'no goal'
-    return Summary(
+def summary(one: Timeline) -> RunSummary:
+    """Summarise a run: what it did from its first goal or path to the end of the last one."""
+    driven = not np.isnan(one.start)
+    start = one.start if driven else np.min(one.time)
+    # Time may go back, and a goal may come after the last odometry.
+    end = max(np.max(one.time) if np.isnan(one.end) else one.end, start)
+    here = (one.time >= start - ROUNDING) & (one.time <= end + ROUNDING)
+    speeds = one.run.odometry.values[here, 3:]
+    on_path = _latest(one.path) > _latest(one.goal)
+    outcome = 'not arrived' if driven else 'no goal'
+    if not driven and len(one.run.goals) + len(one.run.planned_path):
+        outcome = 'refused'
+    if one.outcome.ended:
+        outcome = one.outcome.word
+    law, gains = _law(one, path=on_path) if driven else ('', {})
+    return RunSummary(
         outcome=outcome,
         seconds=float(end - start),
-        length=float(one.travelled()[-1]),
-        distance=_last(one.distance),
-        bearing_error=_greatest(one.bearing_error),
-        across=_greatest(one.across),
-        late=_last(one.late),
-        v=_greatest(odometry[:, 3]),
-        omega=_greatest(odometry[:, 4]),
+        length=float(np.ptp(one.travelled()[here])) if here.any() else 0.0,
+        distance=np.nan if on_path else _last(one.distance[here]),
+        bearing_error=_greatest(one.bearing_error[here]),
+        across=_greatest(one.across[here]),
+        late=_last(one.late[here]),
+        v=_greatest(speeds[:, 0]),
+        omega=_greatest(speeds[:, 1]),
         law=law,
         gains=gains,
     )
 
 
-def table_of(names: Sequence[str], summaries: Sequence[Summary]) -> list[str]:
+def table_of(names: Sequence[str], summaries: Sequence[RunSummary]) -> list[str]:
     """Return the lines of a table of runs. Columns that no run has are left out."""
     columns = {
         'run': [printable(name) for name in names],
@@ -113,17 +125,27 @@ def _latest(which: Indices) -> int:
     return int(np.flatnonzero(which >= 0)[-1]) if (which >= 0).any() else -1
 
 
-def _law(one: Timeline) -> tuple[str, dict[str, str]]:
-    """Return the law that drove last, and what its gains were over the run."""
-    path = _latest(one.path) > _latest(one.goal)
+def _law(one: Timeline, *, path: bool) -> tuple[str, dict[str, str]]:
+    """Return the law of goals or of paths that drove last, and what its gains were from the start."""
+    since, runs = zip(*one.run.configurations(), strict=True)
+    at = on_axis(one.run, since)
+    # From the one that was valid at the start to the last before the end.
+    first = max(int(np.count_nonzero(at <= one.start)) - 1, 0)
+    last = len(at) if np.isnan(one.end) else int(np.count_nonzero(at <= one.end))
     name, gains = '', dict[str, list[str]]()
-    for _, run in one.run.configurations():
+    for run in runs[first : max(last, first + 1)]:
         chosen = chosen_law(run.of_node('go_to_goal'), path=path)
         if chosen.name != name:
             name, gains = chosen.name, {}
         for gain in chosen.gains:
-            text = f'{chosen.values[gain.name]:g}{f" {gain.unit}" if gain.unit else ""}'
+            value = chosen.values[gain.name]
             values = gains.setdefault(gain.name, [])
-            if values[-1:] != [text]:
+            text = f'{value:g}{f" {gain.unit}" if gain.unit else ""}'
+            if not np.isnan(value) and values[-1:] != [text]:
                 values.append(text)
-    return name, {gain: ', then '.join(values) for gain, values in gains.items()}
+    return name, {gain: _changes(values) for gain, values in gains.items() if values}
+
+
+def _changes(values: Sequence[str]) -> str:
+    between = ', ..., ' if len(values) > 2 else ', then '
+    return values[0] if len(values) == 1 else f'{values[0]}{between}{values[-1]}'

@@ -44,6 +44,8 @@ class Timeline:
     """Where the odometry is reset: no path leads there from the message before."""
     goal: Indices
     """Which of `run.goals` is driven to; -1: none."""
+    goals: Indices
+    """Which of `run.goals` were not refused, shape (k,)."""
     start: float
     """When the first goal or path was sent (s); NaN: none was, or it was refused."""
     outcome: GoalState
@@ -111,16 +113,18 @@ def timeline(run: Run) -> Timeline:
     dx, dy = targets[:, 0] - x, targets[:, 1] - y
     to_goal = targets[:, :2] - _driven_points(run)
     last = [sent.rows[-1] for sent, _ in routes if sent.rows and not sent.is_path]
-    paths, path, errors = _along_paths(run, routes, driven)
+    paths, ends, errors = _along_paths(run, routes, driven)
     counts = _over_time(run, lambda now: heading_counts(now.of_node('go_to_goal')))
-    outcome, ended = _outcome(routes, odometry.received[reached])
-    sent = [sent.received for sent, _ in routes if sent.rows]
+    outcome, ended = _outcome(routes, odometry.received[reached], ends)
+    sent = [sent for sent, _ in routes if sent.rows]
+    goals = [row for one in sent if not one.is_path for row in one.rows]
     return Timeline(
         run=run,
         time=seconds(run, odometry),
         breaks=breaks,
         goal=goal,
-        start=float(on_axis(run, sent[:1])[0]) if sent else np.nan,
+        goals=np.array(goals, dtype=np.intp),
+        start=float(on_axis(run, [sent[0].received])[0]) if sent else np.nan,
         outcome=outcome,
         end=float(on_axis(run, [ended])[0]) if ended else np.nan,
         distance=np.hypot(*to_goal.T),
@@ -129,13 +133,8 @@ def timeline(run: Run) -> Timeline:
             np.isin(goal, last) & (counts > 0.0), wrap(targets[:, 2] - theta), np.nan
         ),
         paths=paths,
-        path=path,
-        progress=errors[0],
-        along=errors[1],
-        across=errors[2],
-        path_heading_error=errors[3],
-        late=errors[4],
-        elapsed=errors[5],
+        path=np.asarray(errors.pop('path'), dtype=np.intp),
+        **errors,
     )
 
 
@@ -173,19 +172,23 @@ def jumps(series: Series) -> Indices:
     return np.flatnonzero(reset) + 1
 
 
-def _outcome(routes: list[Followed], reached: Times) -> tuple[GoalState, int]:
+def _outcome(routes: list[Followed], reached: Times, ends: Mapping[int, int]) -> tuple[GoalState, int]:
     """Return what became of the last goals or path, and when they ended (ns); 0: they did not.
 
-    `reached` is when each odometry was recorded at which the last of some goals was reached.
+    Args:
+        routes: All of them.
+        reached: When each odometry was recorded at which the last of some goals was reached (ns).
+        ends: When the odometry was recorded at which the end of a path of unknown state was reached
+            (ns), by its number.
     """
-    for sent, followed in routes[:-2:-1]:
-        if followed.state.ended:
-            return followed.state, int(followed.since)
-        arrived = reached[reached >= sent.received]
-        if followed.state is GoalState.UNKNOWN and len(arrived):
-            return GoalState.SUCCEEDED, int(arrived[0])
-        return followed.state, 0
-    return GoalState.UNKNOWN, 0
+    if not routes:
+        return GoalState.UNKNOWN, 0
+    sent, followed = routes[-1]
+    if followed.state is not GoalState.UNKNOWN:
+        return followed.state, int(followed.since) if followed.state.ended else 0
+    arrived = reached[reached >= sent.received]
+    ended = ends.get(len(routes) - 1, int(arrived[0]) if len(arrived) else 0)
+    return (GoalState.SUCCEEDED if ended else GoalState.UNKNOWN), ended
 
 
 def _breaks(run: Run) -> Indices:
@@ -270,15 +273,25 @@ def _progress(
 
 def _along_paths(
     run: Run, routes: list[Followed], driven: Indices
-) -> tuple[tuple[Path, ...], Indices, Array]:
-    """Return the paths, which is driven along, and progress, errors and times, shape (6, n)."""
+) -> tuple[tuple[Path, ...], dict[int, int], dict[str, Array]]:
+    """Return the paths, and the errors on them.
+
+    Returns:
+        The paths; when the end of those was reached of whose state nothing is known (ns), by the number
+        of their route; and by the names of `Timeline` which is driven along, progress, errors and times.
+    """
     paths: list[Path] = []
-    which, errors = np.full(len(driven), -1), np.full((6, len(driven)), np.nan)
+    ends: dict[int, int] = {}
+    names = ('progress', 'along', 'across', 'path_heading_error', 'late', 'elapsed')
+    errors = {name: np.full(len(driven), np.nan) for name in names}
+    errors['path'] = np.full(len(driven), -1.0)
     poses, stamps = run.odometry.values[:, :3], run.odometry.stamps
-    approach = run.number_of_node(
-        'go_to_goal', 'path_approach_distance', GoToGoalParameters().path_approach_distance
+    defaults = GoToGoalParameters()
+    approach, longest = (
+        run.number_of_node('go_to_goal', name, getattr(defaults, name))
+        for name in ('path_approach_distance', 'odom_timeout')
     )
-    for which_route, (sent, _) in enumerate(routes):
+    for which_route, (sent, followed) in enumerate(routes):
         if not sent.is_path:
             continue
         rows = run.planned_path.values[sent.rows.start : sent.rows.stop]
@@ -288,20 +301,30 @@ def _along_paths(
             # The node refuses it, too.
             continue
         here = np.flatnonzero(driven == which_route)
-        which[here] = len(paths)
-        paths.append(path)
         s = path.project(poses[here])
+        if followed.state is GoalState.UNKNOWN:
+            left = np.hypot(*(poses[here, :2] - path.poses[-1, :2]).T)
+            at_end = (s >= path.length - tolerance(run)) & (left <= tolerance(run))
+            if at_end.any():
+                last = int(np.argmax(at_end))
+                here, s = here[: last + 1], s[: last + 1]
+                ends[which_route] = int(run.odometry.received[here[-1]])
+        errors['path'][here] = len(paths)
+        paths.append(path)
         placed = Path.errors(poses[here], path.poses_at(s))
-        errors[0, here], errors[2, here], errors[3, here] = s, placed.across, placed.heading
+        errors['progress'][here], errors['across'][here] = s, placed.across
+        errors['path_heading_error'][here] = placed.heading
         if path.times is not None:
             dt = np.clip(np.diff(stamps[here], prepend=stamps[here][:1]) / NANOSECONDS, 0.0, None)
             elapsed = [0.0]
-            for pose, step in zip(poses[here].tolist(), dt.tolist(), strict=True):
+            for pose, step in zip(
+                poses[here].tolist(), np.minimum(dt, longest or np.inf).tolist(), strict=True
+            ):
                 elapsed.append(path.time_after(elapsed[-1], pose, step, approach))
-            errors[1, here] = s - np.array([path.at_time(time).s for time in elapsed[1:]])
-            errors[4, here] = np.cumsum(dt) - np.minimum(elapsed[1:], path.duration)
-            errors[5, here] = elapsed[1:]
-    return tuple(paths), which, errors
+            errors['elapsed'][here] = elapsed[1:]
+            errors['along'][here] = s - np.array([path.at_time(time).s for time in elapsed[1:]])
+            errors['late'][here] = np.cumsum(dt) - np.minimum(elapsed[1:], path.duration)
+    return tuple(paths), ends, errors
 
 
 def _distances(run: Run, places: Array, target: int) -> Array:

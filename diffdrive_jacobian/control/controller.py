@@ -74,7 +74,7 @@ class Gain(Checked):
     above: Finite | None = None
     """Lower bound that is itself not allowed, besides `bounds`."""
     label: str = ''
-    """Label on the page, where `_x` and `_{xyz}` are subscripts; default: the name."""
+    """Label on the page; `_{xyz}`, and `_x` at the end of a word, are subscripts. Default: the name."""
     usual: tuple[float, ...] = ()
     """First and last value of the slider and of sweeps; default: a tenth and three times the default."""
 

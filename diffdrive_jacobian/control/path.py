@@ -18,7 +18,7 @@ Source: Bolton 1975, "Biarc curves"; Fritsch and Carlson 1980 for the times.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import cos, floor, hypot, inf, nan, pi, sin
+from math import cos, floor, hypot, inf, isnan, nan, pi, sin
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -303,33 +303,37 @@ class PathProgress:
     """Heading of the robot minus that of the path there (rad)."""
     greatest: float = nan
     """Greatest absolute distance so far (m); NaN: no pose was taken."""
-    elapsed: float = 0.0
-    """Time of a trajectory, which waits for the robot (s)."""
-    seconds: float = 0.0
-    """Time since the robot began (s)."""
+    elapsed: float = nan
+    """Time of a trajectory, which waits for the robot (s); NaN: there are no times."""
+    along: float = nan
+    """How far the robot is ahead of where it should be by then, along the path (m); NaN likewise."""
+    late: float = nan
+    """How long the times have waited so far (s); NaN likewise."""
+    _begun: float = nan
+    _last: float = nan
 
-    def moved(self, pose: Any, dt: float = 0.0, approach: float = inf) -> None:
-        """Take a pose of the robot, `[x, y, theta]` (m, m, rad), and the time since the one before.
+    def moved(self, pose: Any, time: float = 0.0, approach: float = inf, longest: float = inf) -> None:
+        """Take a pose of the robot.
 
-        `dt` and `approach`, for a trajectory, are those of `Path.time_after`.
+        Args:
+            pose: `[x, y, theta]` (m, m, rad).
+            time: Its time (s), from any beginning. The first one is when the robot begins.
+            approach: As for `Path.time_after` (m).
+            longest: Longest step by which the times of a trajectory advance (s).
         """
         self.s = self.path.nearest(pose[0], pose[1], self.s)
-        if self.path.times is not None:
-            self.seconds += dt
-            self.elapsed = self.path.time_after(self.elapsed, pose, dt, approach)
         errors = Path.errors(pose, self.path.at(self.s, 0.0))
         self.across, self.heading = float(errors.across), float(errors.heading)
         self.greatest = float(np.fmax(self.greatest, abs(self.across)))
-
-    @property
-    def along(self) -> float:
-        """How far the robot is ahead of its trajectory, along it (m); NaN: there are no times."""
-        return nan if self.path.times is None else self.s - self.path.at_time(self.elapsed).s
-
-    @property
-    def late(self) -> float:
-        """How long the times have waited so far (s); NaN: there are none."""
-        return nan if self.path.times is None else self.seconds - min(self.elapsed, self.path.duration)
+        if self.path.times is None:
+            return
+        if isnan(self._begun):
+            self._begun, self._last, self.elapsed = time, time, 0.0
+        step = min(max(time - self._last, 0.0), longest)
+        self.elapsed = self.path.time_after(self.elapsed, pose, step, approach)
+        self._last = time
+        self.along = self.s - self.path.at_time(self.elapsed).s
+        self.late = time - self._begun - min(self.elapsed, self.path.duration)
 
     @property
     def remaining(self) -> float:

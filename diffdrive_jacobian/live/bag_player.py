@@ -230,9 +230,8 @@ class RecordedRobot:
             assert path is not None
             path.s, path.across = float(line.progress[index]), float(line.across[index])
             path.heading = float(line.path_heading_error[index])
-            # NaN of a path without times, which nobody reads.
             path.elapsed = float(line.elapsed[index])
-            path.seconds = min(path.elapsed, path.path.duration) + float(line.late[index])
+            path.along, path.late = float(line.along[index]), float(line.late[index])
             return
         number = int(line.goal[index])
         if number < 0:

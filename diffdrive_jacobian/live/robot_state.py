@@ -33,9 +33,6 @@ from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 
 ROBOT_DEFAULTS = VirtualRobotParameters()
 CONTROLLER_DEFAULTS = GoToGoalParameters()
-APPROACH = 'path_approach_distance', CONTROLLER_DEFAULTS.path_approach_distance
-MAX_STEP = 1.0
-"""Longest time between two odometry messages during which a trajectory goes on (s)."""
 Values = Mapping[str, Any]
 Goals = NDArray[np.float64]
 """`[x, y, theta]` of each, shape (n, 3) (m, m, rad)."""
@@ -194,21 +191,18 @@ class GoalProgress:
         self._shown, self.index = FollowedGoal(goals, UNSTAMPED, state), index
         self._use(goals)
 
-    def moved(
-        self,
-        pose: NDArray[np.float64],
-        arrival: Arrival,
-        dt: float = 0.0,
-        approach: float = math.inf,
-    ) -> None:
+    def moved(self, pose: NDArray[np.float64], arrival: Arrival, *following: float) -> None:
         """Take a pose of the robot, `[x, y, theta]`: a waypoint may be reached.
 
-        `dt` and `approach` are those of `PathProgress.moved`.
+        `following` are further arguments of `PathProgress.moved`.
         """
         if self.goals is None or not self.active:
             return
         if self.path is not None:
-            self.path.moved(pose, dt, approach)
+            if self._shown is not None and self._shown.fate is Fate.WAITING:
+                # The controller drives to something else yet.
+                return
+            self.path.moved(pose, *following)
             passed = self.path.path.arc_lengths.searchsorted(self.path.s, 'right')
             self.index = min(int(passed), len(self.goals) - 1)
             return
@@ -224,7 +218,7 @@ class GoalProgress:
         if self.path is not None:
             # All poses would be too many, many times a second.
             path, reference = self.path.path, None
-            if path.times is not None and self.active:
+            if self.active and not math.isnan(self.path.elapsed):
                 reference = rounded(path.at_time(self.path.elapsed)[:3])
             shown = {'goals': rounded(path.poses[-1:]), 'index': 0, 'path': self._points}
             return {**common, **shown, 'reference': reference}
@@ -348,16 +342,18 @@ class RobotState:
         jump = JUMP
         if self._placed:
             self._placed, jump = self._placed - 1, PLACED_JUMP
-        elapsed = time - self.time if self.pose is not None else 0.0
-        far = _longest(elapsed, twist, self.twist)
+        far = _longest(time - self.time, twist, self.twist)
         self.trail = self.trail.extended(float(pose[0]), float(pose[1]), max(jump, far))
         self.time, self.pose, self.twist = time, pose, twist
         if abs(time - self._true_time) > TRUTH_LIFE:
             self.truth = None
         if covariance is not None:
             self.covariance = covariance
-        approach = _number(self.controller_values, *APPROACH)
-        self.goal.moved(pose, self.arrival, min(max(elapsed, 0.0), MAX_STEP), approach)
+        approach, longest = (
+            _number(self.controller_values, name, getattr(CONTROLLER_DEFAULTS, name))
+            for name in ('path_approach_distance', 'odom_timeout')
+        )
+        self.goal.moved(pose, self.arrival, time, approach, longest or math.inf)
 
     def truly_moved(self, time: float, pose: NDArray[np.float64], twist: tuple[float, float]) -> None:
         """Take a ground truth."""

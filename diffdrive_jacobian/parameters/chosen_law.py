@@ -38,13 +38,14 @@ def chosen_law(parameters: Mapping[str, Any], *, path: bool = False) -> ChosenLa
         return ChosenLaw('', None, (), {})
     law = registry.built_in.get(name)
     gains = _unknown_gains(parameters) if law is None else law.gains
-    values = {gain.name: parameters.get(gain.name) for gain in gains}
-    return ChosenLaw(
-        name[:64],
-        law,
-        gains,
-        {key: value if isinstance(value, float) else math.nan for key, value in values.items()},
-    )
+    values = {gain.name: _number(parameters.get(gain.name)) for gain in gains}
+    return ChosenLaw(name[:64], law, gains, values)
+
+
+def _number(value: object) -> float:
+    # Other recorders may store 3 for 3.0.
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return float(value) if number else math.nan  # type: ignore[arg-type]
 
 
 def _unknown_gains(parameters: Mapping[str, Any]) -> tuple[Gain, ...]:

@@ -1,4 +1,4 @@
-"""Pictures of the five documents, each drawn by one function; figures of runs and sweeps.
+"""Pictures of the five documents, each drawn by one function; figures of runs, sweeps and calibrations.
 
 Each function returns a matplotlib figure: `geometry()` the picture that `plot_jacobian geometry` writes,
 `run_figure(runs)` that of `plot_run`. Neither ROS nor a display is needed. matplotlib is imported when

@@ -23,6 +23,8 @@ _STYLE: Any = {
     'grid.color': '#e4e4e4',
     'axes.axisbelow': True,
     'legend.frameon': False,
+    # Of one long line at a time Agg may have not enough memory.
+    'agg.path.chunksize': 10_000,
     'figure.constrained_layout.w_pad': 0.1,
     'figure.constrained_layout.h_pad': 0.08,
 }

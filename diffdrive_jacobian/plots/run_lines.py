@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from diffdrive_jacobian.bags.run import Series, number
-from diffdrive_jacobian.bags.timeline import Array, Indices, Timeline, seconds
+from diffdrive_jacobian.bags.run import number
+from diffdrive_jacobian.bags.timeline import Array, Indices, Timeline, on_axis, seconds
 
 _TWIST = {'v': 0, 'omega': 1}
 _WHEEL = {'right': 0, 'left': 1}
@@ -53,9 +53,7 @@ def limits(one: Timeline) -> dict[str, Array]:
     """
     rows: dict[str, list[list[list[float]]]] = {name: [] for name in _LIMITS}
     for since, run in one.run.configurations():
-        now = np.array([since])
-        at = seconds(run, Series(received=now, stamps=now, values=np.empty((1, 0))))
-        time = max(0.0, float(at[0])) if since else 0.0
+        time = max(0.0, float(on_axis(run, [since])[0])) if since else 0.0
         for name, (nodes, upper, lower) in _LIMITS.items():
             values = [run.of_node(node) for node in nodes]
             most = [number(one.get(upper)) for one in values]

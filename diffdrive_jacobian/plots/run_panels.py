@@ -24,7 +24,7 @@ NEAR = 0.7
 """Share of a limit that a quantity must reach so that the limit is drawn."""
 LIMIT = (0, (6, 3))
 HEADING = (0, (1, 1.2))
-GREY, COMMAND = '#777777', '#d2d2d2'
+COMMAND = '#d2d2d2'
 FAULT_COLORS, FAULT_ALPHA = ('#E69F00', '#56B4E9', '#CC79A7', '#F0E442', '#009E73'), 0.25
 """Colors of the faults. Later ones share them."""
 VIOLATION = '#B00020'
@@ -78,7 +78,7 @@ def quantities(timelines: Sequence[Timeline]) -> list[str]:
     """
     runs = [one.run for one in timelines]
     shown = {'v', 'omega'}
-    if any(len(run.goals) for run in runs):
+    if any(len(one.goals) for one in timelines):
         shown |= {'distance', 'bearing_error'}
     if any(len(run.wheels) + len(run.wheel_commands) for run in runs):
         shown |= {'right', 'left'}
@@ -100,10 +100,10 @@ def window(timelines: Sequence[Timeline]) -> tuple[float, float]:
     begins = []
     for one in timelines:
         places = one.run.odometry.values[:, :2]
-        moved = np.flatnonzero(np.hypot(*(places - places[0]).T) > MOTION)
-        first = one.time[moved[0]] if len(moved) else zero(one)
-        begins.append(min(first, zero(one)) - zero(one))
-    ends = [float(np.max(one.time)) - zero(one) for one in timelines]
+        # Time may go back.
+        moved = one.time[np.hypot(*(places - places[0]).T) > MOTION]
+        begins.append(float(np.min(moved, initial=zero(one))) - zero(one))
+    ends = [max(float(np.max(one.time)) - zero(one), 0.0) for one in timelines]
     margin = 0.02 * max(max(ends) - min(begins), STILL)
     return min(begins) - margin, max(ends) + margin
 
@@ -119,10 +119,10 @@ def draw(panel: Axes, one: Timeline, quantity: str, color: str, style: Any, *, a
     # So that the rounding of a robot at rest does not fill the panel.
     panel.update_datalim([(0.0, -STILL), (0.0, STILL)])
     command, measurement = commanded(one, quantity) - shift, measured(one, quantity) - shift
-    if not len(measurement):
-        panel.plot(*command.T, color=color, ls=style, lw=1.5, drawstyle='steps-post')
-    elif alone:
+    if alone:
         panel.plot(*command.T, color=COMMAND, lw=4.5, drawstyle='steps-post', zorder=1.5)
+    elif not len(measurement):
+        panel.plot(*command.T, color=color, ls=style, lw=1.5, drawstyle='steps-post')
     panel.plot(*measurement.T, color=color, ls=style, lw=1.5)
     if quantity == 'bearing_error' and np.isfinite(one.goal_heading_error).any():
         error = measured(one, 'goal_heading_error') - shift
@@ -130,8 +130,8 @@ def draw(panel: Axes, one: Timeline, quantity: str, color: str, style: Any, *, a
     drawn = False
     for bound in limits(one).get(quantity, ()):
         if _is_near(bound[:, 1], [command[:, 1], measurement[:, 1]]):
-            style = {'color': 'black', 'ls': LIMIT, 'lw': 1.0, 'drawstyle': 'steps-post', 'zorder': 3}
-            panel.plot(*(bound - shift).T, **style)
+            line = (bound - shift).T
+            panel.plot(*line, color='black', ls=LIMIT, lw=1.0, drawstyle='steps-post', zorder=3)
             drawn = True
     return drawn
 
@@ -146,8 +146,8 @@ def _is_near(bound: Array, values: Sequence[Array]) -> bool:
 
 
 def goal_changes(one: Timeline) -> Array:
-    """Return when goals begin or end on the axis of time; none if they are too many (s)."""
-    changes = np.flatnonzero(np.diff(one.goal)) + 1
+    """Return when goals and paths begin or end on the axis of time; none if they are too many (s)."""
+    changes = np.flatnonzero(np.diff(one.goal) | np.diff(one.path)) + 1
     return one.time[changes] - zero(one) if len(changes) <= MARKED else np.empty(0)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import textwrap
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diffdrive_jacobian.bags.run import Run
-from diffdrive_jacobian.bags.summary import Summary, summary
+from diffdrive_jacobian.bags.summary import RunSummary, summary
 from diffdrive_jacobian.bags.timeline import Timeline, timeline
 from diffdrive_jacobian.plots import run_panels
 from diffdrive_jacobian.plots.rendering import picture
-from diffdrive_jacobian.plots.run_layout import Texts, arrange, lay_out
+from diffdrive_jacobian.plots.run_layout import GREY, Texts, arrange, lay_out
 from diffdrive_jacobian.plots.run_lines import commanded
-from diffdrive_jacobian.plots.run_panels import COMMAND, GREY, HEADING, LABELS, LIMIT, ViolationMark
+from diffdrive_jacobian.plots.run_panels import COMMAND, HEADING, LABELS, LIMIT, ViolationMark
 from diffdrive_jacobian.plots.run_plane import COLOR, PLANNED, TRUTH, Plane, extent
 from diffdrive_jacobian.plots.uncertainty import draw_uncertainty, uncertainties, uncertainty_marks
 from diffdrive_jacobian.text import printable
@@ -29,8 +30,10 @@ if TYPE_CHECKING:
 
 LABEL = 40
 """Length beyond which the name of a bag is shortened in the middle."""
-NOTED, NOTE_WIDTH = 4, 150
-"""Number of lines of notes below the figure, and of characters in a line."""
+NOTED = 4
+"""Number of lines of notes below the figure."""
+HEADER_WIDTH, ENTRY_WIDTH, NOTE_WIDTH = 125, 145, 150
+"""Numbers of characters in a line of the title, about a run, and of a note."""
 COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 """The colors of Okabe and Ito that contrast with white. The line styles differ between runs as well."""
 STYLES: tuple[Any, ...] = ('-', (0, (5, 1.5)), '-.', (0, (1.2, 1)), (0, (7, 1.5, 1, 1.5, 1, 1.5)))
@@ -50,11 +53,14 @@ def run_figure(runs: Run | Sequence[Run], violations: Sequence[ViolationMark] = 
     Raises:
         BagError: A run has no odometry.
         ModuleNotFoundError: matplotlib is not installed.
+        ValueError: There is no run.
     """
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     runs = [runs] if isinstance(runs, Run) else runs
+    if not runs:
+        raise ValueError('runs must have at least one run, got none')
     timelines = [timeline(run) for run in runs]
     alone = timelines[0] if len(runs) == 1 else None
     uncertain = [] if alone is None else uncertainties(alone)
@@ -105,11 +111,16 @@ def names_of(paths: Sequence[Path]) -> list[str]:
     return [os.fsencode('/'.join(one[-count:])).decode(errors='replace') for one in parts]
 
 
-def _header(labels: Sequence[str], found: Sequence[Summary]) -> tuple[list[str], list[str]]:
+def _header(labels: Sequence[str], found: Sequence[RunSummary]) -> tuple[list[str], list[str]]:
     """Return the lines above the figure: its title, and of several runs one for each.
 
     The law and those gains that all runs have stand in the title.
     """
+
+    def wrapped(law: str, gains: Mapping[str, str]) -> list[str]:
+        return [part for text in _law(law, gains, 'control law ') for part in wrap(text)]
+
+    wrap = partial(textwrap.wrap, width=HEADER_WIDTH, subsequent_indent='    ')
     common = {
         name: text
         for name, text in found[0].gains.items()
@@ -118,17 +129,18 @@ def _header(labels: Sequence[str], found: Sequence[Summary]) -> tuple[list[str],
     laws = {one.law for one in found}
     names = [_plain(name) for name in labels]
     if len(found) == 1:
-        return [f'{names[0]}: {found[0].described}', *_law(found[0].law, common, 'control law ')], []
+        return [f'{names[0]}: {found[0].described}', *wrapped(found[0].law, common)], []
     entries = []
     for name, one in zip(names, found, strict=True):
         own = {gain: text for gain, text in one.gains.items() if gain not in common}
         law = _law('' if len(laws) == 1 else one.law, own)
-        entries.append(': '.join([name, '; '.join([one.described, *law])]))
-    return _law(found[0].law if len(laws) == 1 else '', common, 'control law '), entries
+        entry = ': '.join([name, '; '.join([one.described, *law])])
+        entries.append(textwrap.shorten(entry, ENTRY_WIDTH, placeholder=' …'))
+    return wrapped(found[0].law if len(laws) == 1 else '', common), entries
 
 
 def _law(name: str, gains: Mapping[str, str], what: str = '') -> list[str]:
-    """Return a line about a law and gains; none if there is nothing to say."""
+    """Return a text about a law and gains; none if there is nothing to say."""
     values = ', '.join(f'{gain} = {text}' for gain, text in gains.items()).replace('^2', '²')
     name = f'{what}{_plain(name)}' if name else ''
     return [': '.join(filter(None, [name, values]))] if name or values else []
@@ -156,8 +168,9 @@ def _notes(runs: Sequence[Run], labels: Sequence[str]) -> list[str]:
 def _time_label(timelines: Sequence[Timeline]) -> str:
     if any(np.isnan(one.start) for one in timelines):
         return 'time [s]'
-    goals = any(len(one.run.goals) for one in timelines)
-    return f'time since the first {"goal" if goals else "path"} [s]'
+    goals, paths = any(len(one.goals) for one in timelines), any(one.paths for one in timelines)
+    since = 'the start' if goals and paths else 'the first path' if paths else 'the first goal'
+    return f'time since {since} [s]'
 
 
 def _finish(panels: dict[str, Axes], timelines: Sequence[Timeline]) -> None:
@@ -192,7 +205,7 @@ def _marks(timelines: Sequence[Timeline], plane: Plane, *, limited: bool) -> lis
     else:
         mark('start', ls='', marker='o', ms=9, mfc='white', mew=1.8)
         mark('end', ls='', marker='s', ms=7)
-    if any(len(one.run.goals) for one in timelines):
+    if any(len(one.goals) for one in timelines):
         with_what = 'tolerance and heading' if plane.headings else 'tolerance'
         mark(f'goal with its {with_what}', ls='', marker=r'$\oplus$', ms=11, color='black')
     if any(one.paths for one in timelines):
@@ -201,12 +214,12 @@ def _marks(timelines: Sequence[Timeline], plane: Plane, *, limited: bool) -> lis
         truth = {'color': COLOR if alone else GREY}
         mark('where the robot truly was', marker='D', ms=5, mfc='white', mew=1.5, **TRUTH, **truth)
     if alone and any(len(commanded(timelines[0], quantity)) for quantity in LABELS):
-        mark('measured', lw=1.5)
+        mark('measured: odometry and joint states', lw=1.5)
         mark('commanded', lw=4.5, color=COMMAND)
     if any(np.isfinite(one.goal_heading_error).any() for one in timelines):
         mark('heading error at the goal', ls=HEADING, lw=2.2)
     if limited:
         mark('limit', ls=LIMIT, lw=1.0, color='black')
     if alone and len(run_panels.goal_changes(timelines[0])):
-        mark('a goal begins or ends', ls=':', lw=0.9, color=GREY)
+        mark('a goal or path begins or ends', ls=':', lw=0.9, color=GREY)
     return marks

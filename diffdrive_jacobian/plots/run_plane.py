@@ -69,7 +69,8 @@ def extent(timelines: Sequence[Timeline], uncertain: Sequence[Array]) -> Array:
         places.append(run.ground_truth.values[:, :2])
         places += [path.poses[:, :2] for path in one.paths]
         reach = tolerance(run)
-        places += [run.goals.values[:, :2] + reach, run.goals.values[:, :2] - reach]
+        goals = run.goals.values[one.goals, :2]
+        places += [goals + reach, goals - reach]
         if robot is not None:
             corners = robot.separation * sketch.BODY
             places += [sketch.placed(corners, pose) for pose in run.odometry.values[[0, -1], :3]]
@@ -147,7 +148,8 @@ class Plane:
         headings: dict[tuple[float, float], float] = {}
         for one in timelines:
             counts = np.unique(one.goal[np.isfinite(one.goal_heading_error)])
-            for index, (x, y, theta) in enumerate(one.run.goals.values.tolist()):
+            for index in one.goals.tolist():
+                x, y, theta = one.run.goals.values[index].tolist()
                 place = round(x, 6), round(y, 6)
                 goals[place] = tolerance(one.run)
                 if index in counts:

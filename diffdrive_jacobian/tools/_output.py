@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from diffdrive_jacobian.errors import DiffdriveError, InterruptionError, NotDoneError, UserError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools.entry_points import FAILED, INTERRUPTED, OUTPUT_ERROR, USER_ERROR
+from diffdrive_jacobian.tools.entry_points import FAILED, INTERRUPTED, USER_ERROR
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,17 +67,8 @@ def tool(program: str) -> Callable[[Main], Main]:
 
 
 def say(path: Path) -> None:
-    """Print the path of a file that was written.
-
-    Raises:
-        NotDoneError: The standard output, which need not be buffered, cannot be written.
-    """
-    try:
-        print(printable(path, PATH_LIMIT))
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise NotDoneError(f'{OUTPUT_ERROR}: {error.strerror}') from error
+    """Print the path of a file that was written."""
+    print(printable(path, PATH_LIMIT))
 
 
 def check(signals: Signals, result: str = '') -> None:

@@ -6,6 +6,7 @@ Each node in `NODES` is a program, and each other public module of this package,
 
 from __future__ import annotations
 
+import errno
 import gc
 import importlib
 import os
@@ -115,7 +116,10 @@ def _run(program: str) -> int:
         print(f'{program}: error: {remedy}', file=sys.stderr)
         code = FAILED
     except OSError as error:
-        print(f'{program}: error: {error}', file=sys.stderr)
+        # Of files the name is known. The output need not be buffered.
+        of_output = error.filename is None and error.errno in (errno.ENOSPC, errno.EIO, errno.EFBIG)
+        why = f'{OUTPUT_ERROR}: {error.strerror}' if of_output else str(error)
+        print(f'{program}: error: {why}', file=sys.stderr)
         code = FAILED
     finally:
         signals.ignore()

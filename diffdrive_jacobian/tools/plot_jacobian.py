@@ -48,7 +48,7 @@ def main(words: Sequence[str], signals: Signals) -> int:
             raise UserError(str(error)) from error
 
     _output.write(path, _output.drawn(PROGRAM, signals, extension(path), draw), replace=options.force)
-    print(path)
+    _output.say(path)
     return DONE
 
 

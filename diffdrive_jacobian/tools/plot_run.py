@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -84,10 +85,10 @@ def _picture(options: argparse.Namespace, bags: Sequence[Path]) -> Path:
             name += options.namespace.replace('/', '_')
         path = bags[0].resolve().parent / f'{name}.png'
         # A bag that does not exist is reported when it is read.
-        if not bags[0].exists():
+        if not os.path.exists(bags[0]):
             return path
         output = str(path)
-    elif output.endswith('/') or Path(output).is_dir():
+    elif output.endswith('/') or os.path.isdir(output):
         raise UserError(
             f'the picture must be a file (.{", .".join(FORMATS)}), got a directory: {output!r}'
         )
@@ -105,8 +106,8 @@ def _tables(options: argparse.Namespace, bags: Sequence[Path]) -> list[Path]:
     if output is None:
         return []
     path = Path(output)
-    if path.is_dir() or output.endswith('/') or not path.suffix:
-        if path.exists() and not path.is_dir():
+    if os.path.isdir(path) or output.endswith('/') or not path.suffix:
+        if os.path.exists(path) and not os.path.isdir(path):
             raise UserError(f'{path} exists already; a CSV file ends in .csv')
         tables = [path / f'{label.replace("/", "_")}.csv' for label in names_of(bags)]
     elif path.suffix.lower() != '.csv':
@@ -118,8 +119,10 @@ def _tables(options: argparse.Namespace, bags: Sequence[Path]) -> list[Path]:
         raise UserError(f'--csv must be a directory for {len(bags)} runs, got {output!r}')
     else:
         tables = [path]
+    if len(set(tables)) < len(tables):
+        raise UserError(f'--csv gives two runs the same table: {", ".join(map(str, tables))}')
     for table in tables:
-        if table.parent.exists():
+        if os.path.exists(table.parent):
             new_file(str(table), ('csv',), 'table', replace=options.force)
             continue
         try:

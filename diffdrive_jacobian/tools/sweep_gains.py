@@ -66,7 +66,9 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             # The other file is still written.
             code = _output.complain(PROGRAM, error, FAILED)
     # Only now: the reader of the output may go away.
-    print(*written, describe_sweep(swept), sep='\n')
+    for path in written:
+        _output.say(path)
+    print(describe_sweep(swept))
     return code
 
 

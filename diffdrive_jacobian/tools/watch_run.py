@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from diffdrive_jacobian.errors import NotDoneError, UserError
 from diffdrive_jacobian.numerics.checks import between
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli, _output
 from diffdrive_jacobian.tools.entry_points import DONE, long_lived
 
@@ -44,7 +45,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
 def _play(options: argparse.Namespace, signals: Signals) -> None:
     from diffdrive_jacobian.live.bag_player import watch_bag
 
-    print(f'reading {options.bag}', flush=True)
+    print(f'reading {printable(options.bag, PATH_LIMIT)}', flush=True)
     ready, speed = announcing(options, notice=PLAYS), options.rate or 1.0
     watch_bag(options.bag, port=options.port, speed=speed, signals=signals, ready=ready)
 

@@ -58,6 +58,13 @@ def test_faults_are_bands_over_time_and_many_are_counted(tmp_path):
     many = labels(run_figure([read_run(write_bag(tmp_path / 'many', sample(events)))]))
     assert len(many) == NAMED
     assert many[-1] == 'and 4 more faults'
+    # Long ones stay in the picture.
+    events += [event(13.0, f"Loss('{60 * 'w'}{number}')", 'begins') for number in range(3)]
+    made = run_figure(read_run(write_bag(tmp_path / 'long', sample(events[6:]))))
+    made.draw_without_rendering()
+    (legend,) = (one.get_window_extent() for one in made.legends)
+    assert 0.0 <= legend.x0 < legend.x1 <= made.bbox.x1
+    assert 0.0 <= legend.y0 < legend.y1 <= made.bbox.y1
 
 
 def test_lines_are_broken_where_time_goes_back_and_a_push_is_a_line(lockstep, robot_at, tmp_path):

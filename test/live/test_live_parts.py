@@ -370,7 +370,10 @@ def test_a_planned_path_is_shown_with_its_errors():
 def test_a_trajectory_waits_for_a_robot_that_is_far_from_it():
     state = RobotState('/')
     state.controller_values = {'path_controller': 'pure_pursuit', 'path_approach_distance': 0.2}
+    # What was before the path does not count.
+    state.moved(2.0, np.zeros(3), (0.0, 0.0), None)
     state.goal.sent(line_path(2.0).timed(0.5), (1, 0))
+    state.moved(3.0, np.zeros(3), (0.0, 0.0), None)
     state.goal.reported(GoalState.EXECUTING, (1, 0))
 
     def moved(time, x):
@@ -387,6 +390,15 @@ def test_a_trajectory_waits_for_a_robot_that_is_far_from_it():
     assert reference[0] == pytest.approx(0.35)
     assert now['along'] == pytest.approx(0.1 - 0.35)
     assert now['late'] == pytest.approx(0.5)
+    # Nor do the times go on while odometry is missing, beyond odom_timeout.
+    state.controller_values = {
+        **state.controller_values,
+        'path_approach_distance': 9.0,
+        'odom_timeout': 0.3,
+    }
+    now, reference = moved(9.0, 0.1)
+    assert reference[0] == pytest.approx(0.35 + 0.5 * 0.3)
+    assert now['late'] == pytest.approx(4.0 - 2.0 * reference[0])
 
 
 # --- Sessions

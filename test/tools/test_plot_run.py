@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import commands
-from support.bags import SECOND, odom, write_bag
+from support.bags import SECOND, odom, status, write_bag
 from support.ros_messages import goal, joint_command, twist, twist_stamped
 from support.ros_messages import path as path_message
 from support.runs import RATE, sample
@@ -23,6 +23,7 @@ from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.plots.output_files import create
 from diffdrive_jacobian.plots.run_panels import COMMAND, LABELS, fault_label
 from diffdrive_jacobian.plots.run_pictures import COLORS, names_of
+from diffdrive_jacobian.plots.run_plane import ARROWS, PLANNED
 from diffdrive_jacobian.tools import _output
 
 plot = partial(commands.run, 'plot_run')
@@ -124,7 +125,7 @@ def test_the_axes_show_the_run_with_units(run):
     assert line.get_drawstyle() == 'steps-post'
     values = [[0.0, 0.5], [1.5, 0.25], [199 / RATE - 0.5, 0.25]]
     assert np.column_stack(line.get_data()) == pytest.approx(np.array(values), abs=1e-9)
-    assert written(made)[0] == 'bag: not arrived within 3.5 s, 1.99 m'
+    assert written(made)[0] == 'bag: not arrived within 3.5 s, 1.74 m'
 
 
 def test_limits_are_drawn_where_they_are_near(run):
@@ -199,6 +200,67 @@ def test_the_robot_is_drawn_to_scale_where_its_size_is_known(run, tmp_path):
         made = run_figure(replace(run, parameters=parameters))
         assert not made.axes[0].patches
         assert 'end' in legends(made)
+
+
+def test_the_plane_has_goals_headings_and_planned_paths(tmp_path):
+    values = {'controller': 'go_to_goal', 'use_goal_heading': True, 'xy_goal_tolerance': 0.05}
+    planned = path_message((0.0, 0.0, 0.0), (1.0, 0.5, 0.0), times=[0.0, 3.0])
+    sent = [(10.5, '/goal_pose', goal(1.0, 0.5, 1.5)), (12.0, '/path', planned)]
+    bag = write_bag(tmp_path / 'bag', sample(sent), parameters={'/go_to_goal': values})
+    made = run_figure(read_run(bag))
+    plane = made.axes[0]
+    (circles,) = (one for one in plane.collections if 'PatchCollection' in type(one).__name__)
+    box = circles.get_paths()[0].get_extents()
+    assert (box.width, box.height) == pytest.approx((0.1, 0.1), abs=1e-3)
+    assert (box.x0 + box.x1, box.y0 + box.y1) == pytest.approx((2.0, 1.0))
+    arrows = [one for one in plane.collections if 'Quiver' in type(one).__name__]
+    (heading,) = (one for one in arrows if len(one.U) == 1)
+    assert (heading.U[0], heading.V[0]) == pytest.approx((math.cos(1.5), math.sin(1.5)))
+    # The others are along the path, which the robot drives at 0.5 rad/s.
+    (along,) = (one for one in arrows if len(one.U) > 1)
+    assert len(along.U) == ARROWS - 1
+    assert np.unwrap(np.arctan2(along.V, along.U)).max() < 2.0
+    (path,) = (one for one in plane.lines if one.get_color() == PLANNED)
+    assert path.get_xydata()[[0, -1]].tolist() == [[0.0, 0.0], [1.0, 0.5]]
+    assert {'goal with its tolerance and heading', 'planned path', 'a goal or path begins or ends'} <= {
+        *legends(made)
+    }
+    panel = by_label(made)[LABELS['v']]
+    assert [one.get_xdata()[0] for one in panel.lines if one.get_linestyle() == ':'] == pytest.approx(
+        [0.0, 1.5]
+    )
+    assert panel.get_xlabel() == ''
+    assert made.axes[-1].get_xlabel() == 'time since the start [s]'
+
+
+def test_a_refused_goal_is_not_drawn(tmp_path):
+    sent = [(10.5, '/goal_pose', goal(90.0, 0.5)), (10.5, '/goal_status', status(6))]
+    made = run_figure(read_run(write_bag(tmp_path / 'bag', sample(sent))))
+    assert made.axes[0].get_xlim()[1] < 10.0
+    assert LABELS['distance'] not in by_label(made)
+    assert written(made)[0].startswith('bag: refused')
+
+
+def test_both_passes_are_shown_where_time_goes_back(tmp_path):
+    """As with a simulation that starts again."""
+    sent = [*sample(count=100), *((at + 2.0, *rest) for at, *rest in sample(count=100, begin=8.0))]
+    sent = [(10.0 + 0.01 * k, topic, one) for k, (_, topic, one) in enumerate(sent)]
+    read = read_run(write_bag(tmp_path / 'bag', [*sent, (10.5, '/goal_pose', goal(3.0, 0.0))]))
+    made = run_figure(read)
+    low, high = by_label(made)[LABELS['v']].get_xlim()
+    shown = drawn(by_label(made)[LABELS['v']])
+    assert low < shown[:, 0].min() < shown[:, 0].max() < high
+    assert 'within -' not in written(made)[0]
+
+
+def test_long_lists_of_gains_are_wrapped_and_cut(run):
+    gains = {f'gain_{"x" * 12}_{letter}': 1.25 for letter in 'abcdefghijkl'}
+    parameters = {'/go_to_goal': {'controller': 'mine', **gains}}
+    made = run_figure(replace(run, parameters=parameters))
+    assert sum('gain_' in one for one in written(made)) == 3
+    assert overlapping(made) == []
+    other = replace(run, path=Path('other'), parameters={'/go_to_goal': {'controller': 'pose'}})
+    assert overlapping(run_figure([replace(run, parameters=parameters), other])) == []
 
 
 def test_without_goals_wheels_and_limits_these_are_left_out(tmp_path):
@@ -329,7 +391,7 @@ def test_a_table_compares_the_runs(bag, folder):
     ]
     assert first.split('  ')[-1].strip() == '0.50 rad/s'
     assert ('not arrived' in first, 'no goal' in second) == (True, True)
-    assert ('3.5 s' in first, '1.99 m' in first, '0.50 m/s' in first) == (True, True, True)
+    assert ('3.5 s' in first, '1.74 m' in first, '0.50 m/s' in first) == (True, True, True)
     # A column ends at the same place in each line.
     assert second.index('0.25 m/s') == first.index('0.50 m/s') == header.index('max v') - 3
 

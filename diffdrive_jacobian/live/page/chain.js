@@ -45,7 +45,7 @@ function link(title, equation, source, symbolic, ...numbers) {
 const toGoal = (target, now) => `(${format(target[0], 2)}, ${format(target[1], 2)}) m   →   d = ${format(now.distance)} m,  e = ${format(now.bearing_error)} rad`
   + (now.goal_heading_error === null ? '' : `, heading at the goal: Δθ = ${format(now.goal_heading_error)} rad`);
 
-const onPath = (now) => `${format(now.distance)} m to go; ${format(Math.abs(now.across))} m ${now.across < 0 ? 'right' : 'left'} of it, turned by ${format(now.path_heading_error)} rad`
+const onPath = (now) => `${format(now.distance)} m to go; ${format(now.across === null ? null : Math.abs(now.across))} m ${now.across < 0 ? 'right' : 'left'} of it, turned by ${format(now.path_heading_error)} rad`
   + (now.late === null ? '' : `, ${format(Math.abs(now.along))} m ${now.along < 0 ? 'behind' : 'ahead of'} its times, ${format(now.late, 1)} s late`);
 
 const unit = (text) => element('span', { class: 'unit' }, text);

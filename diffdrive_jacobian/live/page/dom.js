@@ -19,9 +19,9 @@ export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
-/** Return text as nodes in which `_x` and `_{xyz}` are subscripts. */
+/** Return text as nodes in which `_{xyz}`, and `_x` at the end of a word, are subscripts. */
 export function math(text) {
-  return text.split(/(_\{[^}]*\}|_\w)/).map((part) => (part.startsWith('_') && part.length > 1
+  return text.split(/(_\{[^}]*\}|_\w\b)/).map((part) => (part.startsWith('_') && part.length > 1
     ? element('sub', {}, part.replace(/[_{}]/g, '')) : part));
 }
 

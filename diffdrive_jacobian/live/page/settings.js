@@ -52,7 +52,7 @@ export class Settings {
     const id = `setting-${row.key.replace(/\W/g, '-')}`;
     const label = element('label', { htmlFor: id, title: row.hint }, ...math(row.label));
     const controls = { choice: this.choice, flag: this.flag }[row.kind] ?? this.number;
-    const { nodes, set } = controls.call(this, row, id);
+    const { nodes, set } = controls.call(this, row, id, label);
     for (const node of nodes) node.disabled = this.model.recorded;
     this.rows.set(row.key, set);
     return element('div', { class: 'setting', 'data-key': row.key, title: row.hint }, label, ...nodes);
@@ -70,10 +70,10 @@ export class Settings {
     return { nodes: [box], set: (value) => { box.checked = value; } };
   }
 
-  number(row, id) {
-    const label = row.label.replace(/[_{}]/g, ''), limit = row.kind === 'limit', step = (row.high - row.low) / 400;
+  number(row, id, label) {
+    const limit = row.kind === 'limit', step = (row.high - row.low) / 400;
     const slider = element('input', { id, type: 'range', min: row.low, max: row.high, step, 'aria-description': row.hint });
-    const field = element('input', { type: 'text', inputMode: 'decimal', 'aria-label': `${label}, exact value${limit ? ', empty for none' : ''}`,
+    const field = element('input', { type: 'text', inputMode: 'decimal', 'aria-label': `${label.textContent}, exact value${limit ? ', empty for none' : ''}`,
       placeholder: limit ? 'none' : '' });
     const write = (value) => { field.value = value === null ? '' : plain(value); };
     slider.addEventListener('input', () => { write(Number(slider.value)); this.change(row, Number(slider.value), true); });

@@ -1,0 +1,139 @@
+"""A run in a few numbers, and the table of several."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from support.bags import changed, status, write_bag
+from support.ros_messages import goal, goals, path
+from support.runs import STRAIGHT, sample
+
+from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.bags.summary import summary, table_of
+from diffdrive_jacobian.bags.timeline import timeline
+
+ONE = goal(0.5, 0.0)
+ALONG = path((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+TOPICS = {
+    'GoalStatus': '/goal_status',
+    'Goals': '/goals',
+    'ParameterEvent': '/parameter_events',
+    'Path': '/path',
+    'PoseStamped': '/goal_pose',
+}
+
+
+def summed(tmp_path, *messages, parameters=None, **how):
+    """Summarise a run of a robot that is at x = t / 2 at time t, for 4 s."""
+    tmp_path.mkdir(exist_ok=True)
+    sent = [(at, TOPICS[type(one).__name__], one) for at, one in messages]
+    read = read_run(write_bag(tmp_path / 'run', sample(sent, **STRAIGHT, **how), parameters=parameters))
+    return summary(timeline(read))
+
+
+@pytest.mark.parametrize(
+    ('messages', 'outcome', 'seconds', 'length'),
+    [
+        ([], 'no goal', 3.98, 1.99),
+        # By the node, with or without what came before and after.
+        ([(10.5, ONE), (10.5, status(2)), (11.0, status(4))], 'arrived', 0.5, 0.25),
+        ([(10.0, ONE), (10.0, status(2)), (12.0, status(5))], 'canceled', 2.0, 1.0),
+        ([(10.0, ONE), (10.0, status(2)), (12.0, status(6))], 'aborted', 2.0, 1.0),
+        ([(10.0, goal(9, 0)), (10.0, status(2))], 'not arrived', 3.98, 1.99),
+        ([(11.0, ONE), (11.0, status(6))], 'refused', 3.98, 1.99),
+        # The last one counts, from the first on.
+        (
+            [
+                *((10.0, ONE), (10.0, status(2)), (11.0, status(4))),
+                *((12.0, goal(9, 0)), (12.0, status(2)), (13.0, status(5))),
+            ],
+            'canceled',
+            3.0,
+            1.5,
+        ),
+        # By the tolerance, where nobody says.
+        ([(10.0, ONE)], 'arrived', 0.96, 0.48),
+        ([(10.0, goal(0.5, 0.5))], 'not arrived', 3.98, 1.99),
+        ([(10.0, goals(ONE, goal(1.0, 0.0)))], 'arrived', 1.96, 0.98),
+        ([(10.0, ALONG)], 'arrived', 1.96, 0.98),
+        ([(10.0, path((0, 0, 0), (1, 1, 0)))], 'not arrived', 3.98, 1.99),
+        # After the last odometry.
+        ([(20.0, ONE)], 'not arrived', 0.0, 0.0),
+    ],
+)
+def test_the_outcome_of_the_last_goal_or_path(tmp_path, messages, outcome, seconds, length):
+    found = summed(tmp_path, *messages)
+    assert found.outcome == outcome
+    assert (found.seconds, found.length) == pytest.approx((seconds, length), abs=1e-6)
+    words = {'no goal': '', 'refused': 'refused, ', 'not arrived': 'not arrived within '}
+    expected = f'{words.get(outcome, f"{outcome} after ")}{seconds:.1f} s, {length:.2f} m'
+    assert found.described == expected
+
+
+def test_greatest_values_are_those_of_the_time_between_start_and_end(tmp_path):
+    found = summed(tmp_path, (10.0, goal(1.0, 0.5)), (10.0, status(2)), (11.0, status(5)))
+    assert (found.v, found.omega) == (0.5, 0.0)
+    assert found.bearing_error == pytest.approx(math.atan2(0.5, 0.5), abs=0.01)
+    assert found.distance == pytest.approx(math.hypot(0.5, 0.5), abs=0.02)
+    assert math.isnan(found.across)
+    assert math.isnan(found.late)
+    # A path beside which it drives, too slowly for its times: they wait.
+    beside = path((0.0, 0.1, 0.0), (4.0, 0.1, 0.0), times=[0.0, 4.0])
+    found = summed(tmp_path / 'path', (10.0, beside), (10.0, status(2)))
+    assert found.across == pytest.approx(0.1)
+    # After 0.6 s it is 0.3 m behind.
+    assert found.late == pytest.approx(3.98 / 2 - 0.3, abs=0.1)
+    assert math.isnan(found.distance)
+
+
+def test_the_law_is_the_one_that_drove_with_the_gains_that_it_had(tmp_path):
+    own = {
+        'controller': 'go_to_goal',
+        'path_controller': 'kanayama',
+        'kp': 1.0,
+        'kv': 2,
+        'k_x': 3.0,
+        'k_y': 4.0,
+        'k_theta': 'x',
+    }
+    reached = [(11.0, ONE), (11.0, status(2)), (12.0, status(4))]
+
+    def law(*more, messages=reached):
+        sent = sorted([*messages, *more], key=lambda one: one[0])
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        found = summed(folder, *sent, parameters={'/go_to_goal': own})
+        return found.law, dict(found.gains)
+
+    gains = {'kp': '1 1/s', 'kv': '2 1/s'}
+    assert law() == ('go_to_goal', gains)
+    # Before the first goal, and after the end.
+    before, after = changed('/go_to_goal', 'kp', 5.0), changed('/go_to_goal', 'controller', 'pose')
+    assert law((10.5, before), (12.5, after)) == ('go_to_goal', {**gains, 'kp': '5 1/s'})
+    # Meanwhile: the first and the last one.
+    changes = [(11.1 + 0.01 * k, changed('/go_to_goal', 'kp', 2.0 + k)) for k in range(40)]
+    assert law(changes[0]) == ('go_to_goal', {**gains, 'kp': '1 1/s, then 2 1/s'})
+    assert law(*changes) == ('go_to_goal', {**gains, 'kp': '1 1/s, ..., 41 1/s'})
+    along = [(10.0, ALONG), (10.0, status(2)), (12.0, status(4))]
+    assert law(messages=along) == ('kanayama', {'k_x': '3 1/s', 'k_y': '4 1/m^2'})
+    assert law(messages=[]) == ('', {})
+    assert summed(tmp_path / 'bare', *reached).law == ''
+
+
+def test_the_table_has_the_columns_that_a_run_has(tmp_path):
+    first = summed(tmp_path / 'a', (10.0, ONE), (10.0, status(2)), (11.0, status(4)))
+    second = summed(tmp_path / 'b', (10.0, ALONG), (10.0, status(2)))
+    lines = table_of(['first', 'b'], [first, second])
+    cells = [[one.strip() for one in line.split('  ') if one.strip()] for line in lines]
+    assert cells == [
+        [
+            *('run', 'outcome', 'time', 'length', 'to the goal'),
+            *('max across', 'max bearing error', 'max v', 'max omega'),
+        ],
+        ['first', 'arrived', '1.0 s', '0.50 m', '0.000 m', '0.00 rad', '0.50 m/s', '0.00 rad/s'],
+        ['b', 'not arrived', '4.0 s', '1.99 m', '0.000 m', '0.50 m/s', '0.00 rad/s'],
+    ]
+    ends = [line.rindex('m/s') for line in lines[1:]]
+    assert ends[0] == ends[1]
+    assert np.ptp([len(line) for line in lines]) <= 3
