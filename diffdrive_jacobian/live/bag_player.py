@@ -224,14 +224,22 @@ class RecordedRobot:
 
     def _set_goal(self, index: int) -> None:
         run, line, goal = self.run, self._line, self.state.goal
-        if line.path[index] >= 0:
-            goal.replay(line.paths[line.path[index]], 0)
+        on_path = np.flatnonzero(line.path[: index + 1] >= 0)
+        goals = np.flatnonzero(line.goal[: index + 1] >= 0)
+        if len(on_path) and not (len(goals) and goals[-1] > on_path[-1]):
+            # Also after its end: it has succeeded, or not.
+            last, state = int(on_path[-1]), GoalState.EXECUTING
+            if last < index:
+                now, known = run.odometry.received[index], run.goal_status
+                seen = int(np.searchsorted(known.received, now, side='right'))
+                state = GoalState(int(known.values[seen - 1, 0])) if seen else line.outcome
+            goal.replay(line.paths[line.path[last]], 0, state)
             path = goal.path
             assert path is not None
-            path.s, path.across = float(line.progress[index]), float(line.across[index])
-            path.heading = float(line.path_heading_error[index])
-            path.elapsed = float(line.elapsed[index])
-            path.along, path.late = float(line.along[index]), float(line.late[index])
+            path.s, path.across = float(line.progress[last]), float(line.across[last])
+            path.heading = float(line.path_heading_error[last])
+            path.elapsed = float(line.elapsed[last])
+            path.along, path.late = float(line.along[last]), float(line.late[last])
             return
         number = int(line.goal[index])
         if number < 0:

@@ -62,9 +62,9 @@ SERVICES = {
 class ParameterLink:
     """Reads and sets parameters of one node."""
 
-    def __init__(self, node: Node, target: str) -> None:
-        """Query the values of the node with a fully qualified name."""
-        self.target = target
+    def __init__(self, node: Node, target: str, gid: bytes) -> None:
+        """Query the values of the node with a fully qualified name, and a publisher of this GID."""
+        self.target, self.gid = target, gid
         self.values: dict[str, Any] = {}
         """Values by name, as far as they are known."""
         self.ranges: dict[str, settings.Range] = {}
@@ -200,7 +200,9 @@ class LiveRobot:
         except MessageError:
             covariance = None
         self._seen, self._frame = now, motion.frame
-        self.state.moved(seconds(motion.stamp), np.array(motion.pose), motion.twist, covariance)
+        count = self.topics.followed['odom'].messages
+        pose = np.array(motion.pose)
+        self.state.moved(seconds(motion.stamp), pose, motion.twist, covariance, count)
 
     def _on_goals(self, route: Route) -> None:
         self.state.goal.sent(np.reshape(route.poses, (-1, 3)), route.stamp)
@@ -256,6 +258,9 @@ class LiveRobot:
             self._warn('the robot is driven by hand: release the keys before you send a goal')
             return
         state = self.state
+        if command.append and state.goal.active and state.goal.path is not None:
+            self._warn('a path is driven along: it takes no further waypoint; a goal replaces it')
+            return
         fresh = time.monotonic() - self._sent < ANSWER_PATIENCE
         remaining = state.goal.remaining(fresh=fresh) if command.append else np.empty((0, 3))
         x, y = command.x, command.y
@@ -413,15 +418,19 @@ class LiveRobot:
         for link in self.links.values():
             link.destroy()
 
-    def use_nodes(self, found: dict[str, str]) -> None:
-        """Take the nodes that have the parameters, by role."""
-        for role, name in found.items():
+    def use_nodes(self, found: dict[str, tuple[str, bytes]]) -> None:
+        """Take the nodes that have the parameters, by role: their names, and GIDs of their publishers.
+
+        A node that was started again has another GID.
+        """
+        self.state.controlled = 'controller' in found
+        for role, (name, gid) in found.items():
             link = self.links.get(role)
-            if link is not None and link.target == name:
+            if link is not None and (link.target, link.gid) == (name, gid):
                 continue
             if link is not None:
                 link.destroy()
-            link = self.links[role] = ParameterLink(self._node, name)
+            link = self.links[role] = ParameterLink(self._node, name, gid)
             if role == 'robot':
                 self.state.robot_values = link.values
             else:

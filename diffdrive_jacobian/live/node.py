@@ -16,6 +16,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from diffdrive_jacobian.control import Path
+from diffdrive_jacobian.drives import DISCOVERY_PERIOD as RECORDED_PERIOD
 from diffdrive_jacobian.drives import add_nodes, in_lockstep, in_real_time, recorder_of
 from diffdrive_jacobian.live.commands import Command, Pause, RobotCommand, SetSpeed, Step
 from diffdrive_jacobian.live.live_robot import LiveRobot
@@ -45,6 +46,8 @@ LOST = 30.0
 """Time without odometry and publisher after which a robot is no longer shown (s)."""
 NAP = 0.02
 """Longest time for which `pace` waits before it looks at commands again (s)."""
+RECORDED_AFTER = 1.5 * RECORDED_PERIOD
+"""Time after which the recorder has found the publishers of the page (s)."""
 MAX_LAG = 0.1
 """Time that is made up for at most (s). A machine that is too slow shows time as it comes."""
 
@@ -204,6 +207,8 @@ class LivePage(Node):  # type: ignore[misc]
                 self._pacing.obey(command)
             else:
                 text = 'time is real here: it can neither pause nor change its speed'
+                if self._pacing is not None:
+                    text = 'only a recording has times to go to'
                 self._session.notify(text, 'warning')
             return
         robot = self.robots.get(command.robot)
@@ -230,7 +235,7 @@ class LivePage(Node):  # type: ignore[misc]
                 del self.robots[namespace]
                 continue
             roles = {'robot': publishers, 'controller': self._nodes(robot.topics.full('goal_status'))}
-            robot.use_nodes({role: names[0] for role, names in roles.items() if names})
+            robot.use_nodes({role: nodes[0] for role, nodes in roles.items() if nodes})
             try:
                 robot.topics.use_twist_type(types.get(robot.topics.full('cmd_vel'), []))
             except ParameterError as error:
@@ -258,9 +263,13 @@ class LivePage(Node):  # type: ignore[misc]
             self._refused.add(name)
             self._session.notify(str(error), 'error')
 
-    def _nodes(self, topic: str) -> list[str]:
-        """Return the nodes that publish a topic."""
-        return [node_of(one) for one in self.get_publishers_info_by_topic(topic) if is_named(one)]
+    def _nodes(self, topic: str) -> list[tuple[str, bytes]]:
+        """Return the nodes that publish a topic, and the GIDs of their publishers."""
+        return [
+            (node_of(one), bytes(one.endpoint_gid))
+            for one in self.get_publishers_info_by_topic(topic)
+            if is_named(one)
+        ]
 
     def _on_parameter_event(self, changes: Changes) -> None:
         for robot in self.robots.values():
@@ -351,14 +360,18 @@ def drive_live(
         stack.callback(page.stop)
         discover = recorder_of(runner, recording)
         waiting = [goals] if isinstance(goals, Path) or len(goals) else []
+        since: list[float] = []
 
         def work() -> bool:
             discover()
             page.work()
             robot = next(iter(page.robots.values()), None)
-            # Whoever opened the page wants to see the whole drive.
+            # Whoever opened the page wants to see the whole drive. What is sent at once after the page
+            # has its publishers would not be recorded.
             if waiting and session.watched and robot is not None and robot.ready:
-                robot.send(waiting.pop(), relative=relative)
+                since.append(runner.seconds())
+                if recording is None or since[-1] - since[0] >= RECORDED_AFTER:
+                    robot.send(waiting.pop(), relative=relative)
             return signals.count > 0
 
         if pacing is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -118,10 +119,13 @@ class GoalProgress:
         self.index = 0
         """Index of the goal that is driven to."""
         self._points: Any = None
+        self._drawn: Path | None = None
         self.path: PathProgress | None = None
         """The path that is driven along, and the progress. None: goals are driven to."""
         self._follower: GoalFollower[Goals | Path] = GoalFollower()
         self._shown: FollowedGoal[Goals | Path] | None = None
+        self._kept: tuple[FollowedGoal[Goals | Path] | None, int, PathProgress | None] | None = None
+        """What was shown before, with its progress."""
 
     @property
     def goals(self) -> Goals | None:
@@ -225,18 +229,42 @@ class GoalProgress:
         return {**common, 'goals': rounded(self.goals), 'index': self.index}
 
     def _show(self, followed: FollowedGoal[Goals | Path]) -> None:
-        if followed is not self._shown:
-            self._shown, self.index, self.path = followed, 0, None
-            self._use(followed.goal)
+        before, goals = self._shown, followed.goal
+        if followed is before:
+            return
+        was_driven = self.active
+        kept, self._kept = self._kept, (before, self.index, self.path)
+        self._shown = followed
+        if kept is not None and kept[0] is followed:
+            # What came after it was refused.
+            _, self.index, path = kept
+            self._use(goals, path)
+        elif was_driven and isinstance(goals, Path) and self._is_same(goals):
+            # A planner repeats its path. On the same one the controller goes on where it is.
+            self._use(goals, self.path)
+        else:
+            self.index = 0
+            self._use(goals)
 
-    def _use(self, goals: Goals | Path | None) -> None:
-        """Take what is driven to, the progress along a path as it was if it is the same."""
+    def _is_same(self, path: Path) -> bool:
+        """Return whether a path is the one that is driven along."""
+        if self.path is None or not np.array_equal(path.poses, self.path.path.poses):
+            return False
+        one, two = path.times, self.path.path.times
+        return one is two if one is None or two is None else np.array_equal(one, two)
+
+    def _use(self, goals: Goals | Path | None, progress: PathProgress | None = None) -> None:
+        """Take what is driven to, and the progress along a path; None: it begins."""
         if not isinstance(goals, Path):
             self.path = None
+        elif progress is not None:
+            self.path = progress
         elif self.path is None or self.path.path is not goals:
             self.path = PathProgress(goals)
-            s = np.linspace(0.0, goals.length, MAX_PLANNED)
-            self._points = rounded(goals.poses_at(s)[:, :2])
+        if self.path is not None and self.path.path is not self._drawn:
+            self._drawn = self.path.path
+            s = np.linspace(0.0, self._drawn.length, MAX_PLANNED)
+            self._points = rounded(self._drawn.poses_at(s)[:, :2])
 
 
 def _number(values: Values, name: str, default: float) -> float:
@@ -278,6 +306,8 @@ class RobotState:
         """Parameters of the node that publishes odom."""
         self.controller_values: Values = {}
         """Parameters of the node that publishes goal_status."""
+        self.controlled = True
+        """Whether a node publishes goal_status."""
 
     @property
     def geometry(self) -> tuple[float, float]:
@@ -306,6 +336,13 @@ class RobotState:
         left = self.robot_values.get('left_wheel_name', usual[0])
         right = self.robot_values.get('right_wheel_name', usual[1])
         return (left, right) if isinstance(left, str) and isinstance(right, str) else usual
+
+    @property
+    def along_path(self) -> bool:
+        """Whether the law of paths drives: along a path, or through waypoints without a stop."""
+        goals = self.goal.goals
+        passing = self.controller_values.get('pass_waypoints') is True
+        return self.goal.path is not None or (passing and goals is not None and len(goals) > 1)
 
     @property
     def arrival(self) -> Arrival:
@@ -337,8 +374,9 @@ class RobotState:
         pose: NDArray[np.float64],
         twist: tuple[float, float],
         covariance: NDArray[np.float64] | None,
+        messages: int = 1,
     ) -> None:
-        """Take an odometry."""
+        """Take an odometry, the last one of so many messages."""
         jump = JUMP
         if self._placed:
             self._placed, jump = self._placed - 1, PLACED_JUMP
@@ -353,7 +391,12 @@ class RobotState:
             _number(self.controller_values, name, getattr(CONTROLLER_DEFAULTS, name))
             for name in ('path_approach_distance', 'odom_timeout')
         )
-        self.goal.moved(pose, self.arrival, time, approach, longest or math.inf)
+        arrival = self.arrival
+        if self.along_path:
+            passed = _number(self.controller_values, 'waypoint_tolerance', arrival.xy_tolerance)
+            arrival = replace(arrival, xy_tolerance=max(passed, 0.0))
+        longest = messages * longest or math.inf
+        self.goal.moved(pose, arrival, time, approach, longest)
 
     def truly_moved(self, time: float, pose: NDArray[np.float64], twist: tuple[float, float]) -> None:
         """Take a ground truth."""
@@ -428,6 +471,8 @@ class RobotState:
             'true_distance': rounded(true_distance),
             'truth': rounded(self.truth),
             'law': self._law(target if self.goal.active else None),
+            'along_path': self.along_path,
+            'controlled': self.controlled,
             'by_hand': by_hand,
             'commanded': self.command is not None,
             'chain': chain,
@@ -439,7 +484,10 @@ class RobotState:
         That is not known of a path, for the look-ahead is the controller's, nor of a law of another
         package, which may be slow.
         """
-        name, law, gains, values = chosen_law(self.controller_values, path=self.goal.path is not None)
+        if self.goal.active and self.goal.goals is None:
+            # They were sent before this program listened: goals or a path.
+            return {'name': '', 'gains': {}, 'twist': None}
+        name, law, gains, values = chosen_law(self.controller_values, path=self.along_path)
         twist = None
         if target is not None and self.pose is not None and isinstance(law, Controller):
             with suppress(LawError):
@@ -452,5 +500,4 @@ class RobotState:
     ) -> list[dict[str, Any]]:
         """Return the settings for the page; the arguments are those of `settings.shown`."""
         values = {'controller': self.controller_values, 'robot': self.robot_values}
-        path = self.goal.path is not None
-        return settings.shown(values, ranges or {}, path=path, imported=imported)
+        return settings.shown(values, ranges or {}, path=self.along_path, imported=imported)

@@ -46,6 +46,9 @@ class Latest:
         self._read: Callable[[bytes], Any] = codec.reader(kind, deserialize_message)
         self._polled = polled
         self._data: bytes | None = None
+        self._count = 0
+        self.messages = 0
+        """How many messages came before the last call of `take`, which returned the last one."""
         group = Polled() if polled else None
         with explaining_failure(node, kind, topic):
             self._subscription: Subscription = node.create_subscription(
@@ -54,14 +57,16 @@ class Latest:
 
     def _store(self, data: bytes) -> None:
         self._data = data
+        self._count += 1
 
     def take(self) -> Any | None:
         """Return the value that was received since the last call. None: none, or an invalid one."""
         if self._polled:
             # The queue has one place; more than that is a flood, which must not hold up the page.
             for message in islice(waiting_messages(self._subscription), 2):
-                self._data = message.data
+                self._store(message.data)
         latest, self._data = self._data, None
+        self.messages, self._count = self._count, 0
         if latest is None or len(latest) > MAX_SIZE:
             return None
         try:

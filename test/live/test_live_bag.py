@@ -166,6 +166,12 @@ def test_a_trajectory_is_replayed_with_its_law_errors_and_times(tmp_path):
         ]
         assert rows['controller/k_y']['value'] == law['gains']['k_y']
     assert late[0] == 0.0 < late[-1]
+    # After the end it has arrived, and nothing else is driven.
+    player.send(Seek(1e6))
+    goal, rows = player.robot['goal'], player.snapshot.fixed['settings']['/']
+    assert (goal['state'], goal['active'], goal['reference']) == ('succeeded', False, None)
+    assert goal['path'][-1] == [2.0, 0.0]
+    assert (player.robot['law']['name'], rows[0]['key']) == ('kanayama', 'controller/k_x')
     assert robots[0].strips()['late'][90] == pytest.approx(late[-1])
 
 

@@ -14,6 +14,8 @@ from chromium import Browser, find_chromium, until
 from support import processes
 from support.processes import open_world
 
+from diffdrive_jacobian.bags import read_run
+
 pytestmark = [pytest.mark.browser, pytest.mark.process]
 
 QUICK = ('--ros-args', '-p', 'go_to_goal:kp:=8.0', '-p', 'go_to_goal:kv:=4.0')
@@ -232,8 +234,8 @@ def test_on_a_path_its_law_drives_and_is_chosen_and_tuned(live, tmp_path):
         'dynamic_feedback': ('k_position', 'Oriolo 2002'),
         'pure_pursuit': ('lookahead_distance', 'Coulter 1992'),
     }
-    arguments = ('--live', '--lockstep', '--no-record', '--no-browser', '--path', 'circle:2.0')
-    trajectory = ('--trajectory', '0.3', '--path-controller', 'kanayama')
+    arguments = ('--live', '--lockstep', '--no-browser', '--path', 'circle:2.0')
+    trajectory = ('--trajectory', '0.3', '--path-controller', 'kanayama', '-o', f'{tmp_path}/bag')
     browser = live.browser
     with open_world(tmp_path) as world:
         child = world.start('drive_to', *arguments, *trajectory)
@@ -266,8 +268,17 @@ def test_on_a_path_its_law_drives_and_is_chosen_and_tuned(live, tmp_path):
         assert 'm to go' in browser.text('#summary')
         assert browser.evaluate('document.getElementById("timed").hidden') is False
         assert browser.errors == []
+        # A list that was reached by keys keeps them: the robot goes on.
+        browser.evaluate(f'{choice}.focus()')
+        for _ in range(3):
+            for kind in ('Down', 'Up'):
+                browser.key(kind, 'ArrowUp')
+        assert browser.evaluate(f'document.activeElement === {choice}')
+        assert browser.text('#state') == 'driving'
         child.signal(signal.SIGINT)
         assert child.exit() == 0
+    # Although the page was opened at once.
+    assert len(read_run(tmp_path / 'bag').planned_path) > 10
     browser.open(live.url)
     browser.until('document.querySelector("#sliders input") !== null')
 

@@ -330,12 +330,18 @@ def test_a_node_that_changes_its_name_leaves_nothing_behind(driven):
     robot = driven.node.robots['/']
     before = len(list(driven.node.clients))
     for number in range(5):
-        robot.use_nodes({'robot': f'/robot_{number}', 'controller': f'/controller_{number}'})
+        robot.use_nodes({role: (f'/{role}_{number}', b'') for role in ('robot', 'controller')})
         refused = []
         robot.links['robot'].set('x', 1.0, refused.append)
     assert len(list(driven.node.clients)) <= before + 2 * 3
-    robot.use_nodes({'robot': '/virtual_robot'})
+    robot.use_nodes({'robot': ('/virtual_robot', b'')})
     assert refused == ['/robot_4 is gone']
+    # One that was started again has the same name, and perhaps other parameters.
+    link = robot.links['robot']
+    for gid in (b'', b'', b'again'):
+        robot.use_nodes({'robot': ('/virtual_robot', gid)})
+        assert (robot.links['robot'] is link) == (gid == b'')
+    assert not robot.state.controlled
     robot.destroy()
     assert not list(driven.node.clients)
 

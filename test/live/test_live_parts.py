@@ -401,6 +401,56 @@ def test_a_trajectory_waits_for_a_robot_that_is_far_from_it():
     assert now['late'] == pytest.approx(4.0 - 2.0 * reference[0])
 
 
+def test_the_progress_on_a_path_outlives_a_refused_goal_and_the_same_path_again():
+    goal = GoalProgress()
+    goal.sent(line_path(4.0), (1, 0))
+    goal.reported(GoalState.EXECUTING, (1, 0))
+    for x in (0.0, 0.3, 0.6):
+        goal.moved(np.array([x, 0.1, 0.0]), Arrival())
+    assert goal.path.s == pytest.approx(0.6)
+    # While it waits for an answer nothing is known of it.
+    goal.sent(at(9.0, 9.0), (2, 0))
+    assert goal.path is None
+    goal.reported(GoalState.ABORTED, (2, 0))
+    goal.reported(GoalState.EXECUTING, (1, 0))
+    assert (goal.path.s, goal.active) == (pytest.approx(0.6), True)
+    # A planner repeats its path.
+    goal.sent(line_path(4.0), (3, 0))
+    goal.reported(GoalState.EXECUTING, (3, 0))
+    assert goal.path.s == pytest.approx(0.6)
+    for other in (line_path(3.0), line_path(4.0).timed(1.0)):
+        goal.sent(other, (4, int(other.length)))
+        goal.moved(np.array([0.9, 0.0, 0.0]), Arrival())
+        assert goal.path.s == 0.0
+        goal.reported(GoalState.EXECUTING, (4, int(other.length)))
+        goal.moved(np.array([0.4, 0.0, 0.0]), Arrival())
+        assert goal.path.s == pytest.approx(0.4)
+
+
+def test_through_waypoints_without_a_stop_the_law_of_paths_drives():
+    state = RobotState('/')
+    state.controller_values = {
+        'controller': 'pose',
+        'path_controller': 'kanayama',
+        'pass_waypoints': True,
+        'waypoint_tolerance': 0.2,
+    }
+    state.goal.sent(at(1.0, 0.0), (1, 0))
+    state.goal.reported(GoalState.EXECUTING, (1, 0))
+    assert not state.along_path
+    state.goal.sent(np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), (2, 0))
+    state.goal.reported(GoalState.EXECUTING, (2, 0))
+    state.moved(1.0, np.array([0.85, 0.0, 0.0]), (0.1, 0.0), None)
+    shown = state.shown(age=0.0, by_hand=False)
+    assert (shown['law']['name'], shown['along_path'], shown['goal']['index']) == ('kanayama', True, 1)
+    # Of goals that were sent before this program listened nothing is known.
+    late = RobotState('/')
+    late.controller_values = state.controller_values
+    late.goal.reported(GoalState.EXECUTING, (7, 0))
+    late.moved(1.0, np.zeros(3), (0.1, 0.0), None)
+    assert late.shown(age=0.0, by_hand=False)['law']['name'] == ''
+
+
 # --- Sessions
 
 

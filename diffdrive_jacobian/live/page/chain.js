@@ -87,7 +87,7 @@ export class Chain {
       : target ? toGoal(target, now)
       : robot.by_hand ? 'none: driven by hand' : recorded ? 'none' : 'none: click on the map');
     this.links.goal.node.classList.toggle('idle', !target);
-    const [formula, source] = (path ? PATH_LAWS : LAWS)[law.name] ?? ['[v, ω] = law(pose, goal)', law.name || 'not known'];
+    const [formula, source] = (robot.along_path ? PATH_LAWS : LAWS)[law.name] ?? ['[v, ω] = law(pose, goal)', law.name || 'not known'];
     setMath(this.links.law.formula, robot.by_hand ? 'your keys' : formula);
     setText(this.links.law.heading.lastChild, robot.by_hand ? '' : source);
     setMath(this.law, this.describe(robot));

@@ -14,6 +14,14 @@ export function element(tag, properties = {}, ...children) {
   return made;
 }
 
+/** Give up the focus after a change by mouse or finger, so that keys drive again; a keyboard goes on choosing. */
+export function leaveAfterPointer(node) {
+  let keys = false;
+  node.addEventListener('keydown', () => { keys = true; });
+  node.addEventListener('pointerdown', () => { keys = false; });
+  node.addEventListener('change', () => { if (!keys) node.blur(); });
+}
+
 /** Set the text of an element if it is new. */
 export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;

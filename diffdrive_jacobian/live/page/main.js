@@ -125,7 +125,7 @@ addEventListener('keydown', (event) => {
 });
 
 const STRIP_PERIOD = 80;
-let before = performance.now(), stripped = 0, moving = false, fitted = false;
+let before = performance.now(), stripped = 0, stale = false, moving = false, fitted = false;
 function draw(now) {
   requestAnimationFrame(draw);
   const fresh = changed, [x, y, scale] = [view.x, view.y, view.scale];
@@ -133,8 +133,10 @@ function draw(now) {
     changed = false;
     showPanels();
   }
-  if (fresh && now - stripped > STRIP_PERIOD) {
+  stale ||= fresh;
+  if (stale && now - stripped > STRIP_PERIOD) {
     stripped = now;
+    stale = false;
     strips.draw(drawing.colors);
   }
   if (model.recorded && !fitted && model.paths.size) { fitted = true; drawing.draw(0); byId('fit').click(); }

@@ -62,7 +62,7 @@ export class MapDrawing {
         context.fillStyle = colors.muted;
         const label = `${(k * step).toFixed(digits).replace('-', '−')}`;
         if (vertical) context.fillText(label, px + 3, height - 7);
-        else if (py < height - 20 && py > 125) context.fillText(label, 5, py - 3);
+        else if (py < height - 20 && py > 160) context.fillText(label, 5, py - 3);
       }
     }
   }

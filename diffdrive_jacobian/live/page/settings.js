@@ -1,6 +1,6 @@
 // Sliders for the parameters of the nodes. A value that a node refuses goes back.
 
-import { byId, element, math, parseNumber, plain, setText } from './dom.js';
+import { byId, element, leaveAfterPointer, math, parseNumber, plain, setText } from './dom.js';
 
 const PERIOD = 120;
 const REST = 900;
@@ -11,6 +11,8 @@ export class Settings {
     this.send = send;
     this.rows = new Map();
     this.shown = '';
+    /** Groups that were opened. */
+    this.opened = new Set();
     /** When each was sent last. */
     this.sent = new Map();
   }
@@ -38,8 +40,10 @@ export class Settings {
     for (const row of rows) {
       const node = this.create(row);
       if (row.group && !groups.has(row.group)) {
-        const open = rows.some((one) => one.group === row.group && one.used);
-        groups.set(row.group, element('details', { open }, element('summary', {}, row.group)));
+        const open = rows.some((one) => one.group === row.group && one.used) || this.opened.has(row.group);
+        const group = element('details', { open }, element('summary', {}, row.group));
+        group.addEventListener('toggle', () => this.opened[group.open ? 'add' : 'delete'](row.group));
+        groups.set(row.group, group);
         nodes.push(groups.get(row.group));
       }
       if (row.group) groups.get(row.group).append(node);
@@ -60,13 +64,15 @@ export class Settings {
 
   choice(row, id) {
     const select = element('select', { id }, ...row.choices.map((name) => element('option', { value: name }, name)));
-    select.addEventListener('change', () => { this.change(row, select.value); select.blur(); });
+    select.addEventListener('change', () => this.change(row, select.value));
+    leaveAfterPointer(select);
     return { nodes: [select], set: (value) => { select.value = value; } };
   }
 
   flag(row, id) {
     const box = element('input', { id, type: 'checkbox' });
-    box.addEventListener('change', () => { this.change(row, box.checked); box.blur(); });
+    box.addEventListener('change', () => this.change(row, box.checked));
+    leaveAfterPointer(box);
     return { nodes: [box], set: (value) => { box.checked = value; } };
   }
 

@@ -18,6 +18,7 @@ function described(robot, recorded) {
   const [badge, kind] = robot.by_hand ? ['by hand', 'hand'] : STATES[goal.state] ?? STATES.unknown;
   if (age > 1) return ['silent', 'bad', `no odometry for ${format(age, 0)} s`];
   if (robot.by_hand) return [badge, kind, 'release to stop'];
+  if (goal.active && !robot.controlled && !recorded) return ['lost', 'bad', 'nobody publishes goal_status any more: the controller has ended'];
   const { distance, across, late } = robot.now;
   const truly = robot.true_distance === null ? '' : `, truly ${format(robot.true_distance)} m`;
   if (goal.state === 'succeeded' && distance !== null) return [badge, kind, `now ${format(distance)} m from the goal${truly}`];

@@ -1,7 +1,8 @@
 // Pause, step, speed, and the time of a bag.
 
-import { byId, element, format, setText } from './dom.js';
+import { byId, element, format, leaveAfterPointer, setText } from './dom.js';
 
+const SEEK_PERIOD = 30;
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10, 50];
 
 export class Transport {
@@ -9,14 +10,16 @@ export class Transport {
     this.model = model;
     this.send = send;
     this.seeking = -Infinity;
+    this.wanted = null;
     for (const speed of SPEEDS) byId('speed').append(element('option', { value: speed }, `${speed}×`));
     byId('play').addEventListener('click', () => this.toggle());
     byId('step').addEventListener('click', () => send({ do: 'step' }));
-    byId('speed').addEventListener('change', () => { send({ do: 'speed', speed: Number(byId('speed').value) }); byId('speed').blur(); });
+    byId('speed').addEventListener('change', () => send({ do: 'speed', speed: Number(byId('speed').value) }));
+    leaveAfterPointer(byId('speed'));
     byId('time').addEventListener('input', () => this.seek(Number(byId('time').value)));
     byId('time').addEventListener('pointerup', () => byId('time').blur());
     addEventListener('keydown', (event) => {
-      if (event.code !== 'Space' || event.repeat || event.target.matches?.('input, select, button')) return;
+      if (event.code !== 'Space' || event.repeat || event.target.matches?.('input, select, button, summary')) return;
       if (model.world.kind === 'robots') return;
       event.preventDefault();
       this.toggle();
@@ -27,9 +30,14 @@ export class Transport {
     this.send({ do: 'pause', paused: !this.model.world.paused });
   }
 
+  /** Go to a time; of many in a row the last one counts. */
   seek(time) {
     this.seeking = performance.now();
-    this.send({ do: 'seek', time: Math.max(0, time) });
+    this.wanted ??= setTimeout(() => {
+      this.send({ do: 'seek', time: Math.max(0, this.time) });
+      this.wanted = null;
+    }, SEEK_PERIOD);
+    this.time = time;
   }
 
   show() {
