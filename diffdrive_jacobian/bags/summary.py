@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffdrive_jacobian.bags.timeline import Array, Indices, Timeline, on_axis
+from diffdrive_jacobian.bags.timeline import Array, Indices, Timeline, on_axis, seconds
 from diffdrive_jacobian.parameters.chosen_law import chosen_law
 from diffdrive_jacobian.text import printable
 
@@ -38,18 +38,23 @@ class RunSummary:
     """Greatest speed (m/s)."""
     omega: float
     """Greatest yaw rate (rad/s)."""
-    law: str
-    """Control law of the last goal or path; '': not known."""
-    gains: Mapping[str, str]
-    """Its gains with their units, by name; the first and the last value of those that were changed."""
+    true_distance: float
+    """Distance to the last goal, or the end of the last path, at the end by ground truth (m)."""
+    laws: Mapping[str, Mapping[str, str]]
+    """The control laws that drove, in order, with their gains and units by name: the first and the last
+    value of those that were changed."""
 
     @property
     def described(self) -> str:
         """What became of the goals and when, and the distance travelled."""
+        if self.outcome in ('no goal', 'refused'):
+            return f'{self.outcome}, {self.seconds:.1f} s, {self.length:.2f} m driven'
         when = 'within' if self.outcome == 'not arrived' else 'after'
-        outcome = '' if self.outcome == 'no goal' else f'{self.outcome} {when} '
-        outcome = 'refused, ' if self.outcome == 'refused' else outcome
-        return f'{outcome}{self.seconds:.1f} s, {self.length:.2f} m'
+        text = f'{self.outcome} {when} {self.seconds:.1f} s, {self.length:.2f} m driven'
+        if np.isnan(self.true_distance):
+            return text
+        # The outcome is the opinion of the odometry.
+        return f'by odometry {text}; truly {self.true_distance:.2f} m away'
 
 
 def summary(one: Timeline) -> RunSummary:
@@ -66,7 +71,6 @@ def summary(one: Timeline) -> RunSummary:
         outcome = 'refused'
     if one.outcome.ended:
         outcome = one.outcome.word
-    law, gains = _law(one, path=on_path) if driven else ('', {})
     return RunSummary(
         outcome=outcome,
         seconds=float(end - start),
@@ -77,8 +81,8 @@ def summary(one: Timeline) -> RunSummary:
         late=_last(one.late[here]),
         v=_greatest(speeds[:, 0]),
         omega=_greatest(speeds[:, 1]),
-        law=law,
-        gains=gains,
+        true_distance=_true_distance(one, end, on_path=on_path),
+        laws=_laws(one) if driven else {},
     )
 
 
@@ -90,6 +94,7 @@ def table_of(names: Sequence[str], summaries: Sequence[RunSummary]) -> list[str]
         'time': [f'{one.seconds:.1f} s' for one in summaries],
         'length': [f'{one.length:.2f} m' for one in summaries],
         'to the goal': [_with_unit(one.distance, '.3f', 'm') for one in summaries],
+        'truly': [_with_unit(one.true_distance, '.3f', 'm') for one in summaries],
         'late': [_with_unit(one.late, '.1f', 's') for one in summaries],
         'max across': [_with_unit(one.across, '.3f', 'm') for one in summaries],
         'max bearing error': [_with_unit(one.bearing_error, '.2f', 'rad') for one in summaries],
@@ -125,25 +130,41 @@ def _latest(which: Indices) -> int:
     return int(np.flatnonzero(which >= 0)[-1]) if (which >= 0).any() else -1
 
 
-def _law(one: Timeline, *, path: bool) -> tuple[str, dict[str, str]]:
-    """Return the law of goals or of paths that drove last, and what its gains were from the start."""
+def _true_distance(one: Timeline, end: float, *, on_path: bool) -> float:
+    """Return the distance by ground truth at the end (m). NaN: it is not known."""
+    truth = one.run.ground_truth
+    here = np.flatnonzero(seconds(one.run, truth) <= end + ROUNDING)
+    if not len(here) or np.isnan(one.start):
+        return np.nan
+    target = one.paths[-1].poses[-1] if on_path else one.run.goals.values[one.goals[-1]]
+    return float(np.hypot(*(truth.values[here[-1], :2] - target[:2])))
+
+
+def _laws(one: Timeline) -> dict[str, dict[str, str]]:
+    """Return the laws that drove, and what their gains were while they did."""
     since, runs = zip(*one.run.configurations(), strict=True)
     at = on_axis(one.run, since)
-    # From the one that was valid at the start to the last before the end.
-    first = max(int(np.count_nonzero(at <= one.start)) - 1, 0)
-    last = len(at) if np.isnan(one.end) else int(np.count_nonzero(at <= one.end))
-    name, gains = '', dict[str, list[str]]()
-    for run in runs[first : max(last, first + 1)]:
-        chosen = chosen_law(run.of_node('go_to_goal'), path=path)
-        if chosen.name != name:
-            name, gains = chosen.name, {}
-        for gain in chosen.gains:
-            value = chosen.values[gain.name]
-            values = gains.setdefault(gain.name, [])
-            text = f'{value:g}{f" {gain.unit}" if gain.unit else ""}'
-            if not np.isnan(value) and values[-1:] != [text]:
-                values.append(text)
-    return name, {gain: _changes(values) for gain, values in gains.items() if values}
+    laws: dict[str, dict[str, list[str]]] = {}
+    kinds = [(one.goal, False), (one.path, True)]
+    for which, path in sorted(kinds, key=lambda kind: int(np.argmax(kind[0] >= 0))):
+        driven = one.time[(which >= 0) & (np.isnan(one.end) | (one.time <= one.end + ROUNDING))]
+        if not len(driven):
+            continue
+        # From the one that was valid at the start to the last before the end.
+        first = max(int(np.count_nonzero(at <= driven.min() + ROUNDING)) - 1, 0)
+        last = int(np.count_nonzero(at <= driven.max() + ROUNDING))
+        for run in runs[first : max(last, first + 1)]:
+            law = chosen_law(run.of_node('go_to_goal'), path=path)
+            gains = laws.setdefault(law.name, {}) if law.name else {}
+            for gain in law.gains:
+                value, values = law.values[gain.name], gains.setdefault(gain.name, [])
+                text = f'{value:g}{f" {gain.unit}" if gain.unit else ""}'
+                if not np.isnan(value) and values[-1:] != [text]:
+                    values.append(text)
+    return {
+        name: {gain: _changes(values) for gain, values in gains.items() if values}
+        for name, gains in laws.items()
+    }
 
 
 def _changes(values: Sequence[str]) -> str:

@@ -97,17 +97,21 @@ def lay_out(
     above, plane_width, plane_height, _, columns = arrangement
     marks_lines = sum(one.get_label().count('\n') + 1 for one in texts.marks)
     marks_height = LINE * marks_lines + 0.1
+    longest = max(len(line) for one in texts.marks for line in one.get_label().split('\n'))
+    marks_width = 0.55 + LETTER * longest
     right_of_plane = EDGE + TICKS + max(plane_width, PLANE_LEAST) + 0.25
     run_line = LINE * min(1.0, RUNS / max(len(texts.runs), 1))
     runs_top = EDGE + HEADER_LINE * len(texts.header)
     top = runs_top + run_line * len(texts.runs) + 0.1
     if above:
         marks_fit = marks_height <= plane_height + AXIS
+        marks_fit &= right_of_plane + marks_width <= WIDTH - EDGE
         plane_top, panels_left = top, EDGE
         panels_top = top + plane_height + AXIS + TITLE
         marks_at = right_of_plane, top
     else:
         marks_fit = marks_height <= arrangement.panels_height - TITLE - plane_height - 0.1
+        marks_fit &= EDGE + TICKS + marks_width <= right_of_plane + TICKS
         plane_top = panels_top = top + TITLE
         panels_left = right_of_plane
         marks_at = EDGE + TICKS - 0.1, plane_top + plane_height + AXIS
@@ -116,8 +120,7 @@ def lay_out(
     if not marks_fit:
         # In rows below everything.
         marks_at = EDGE, bottom + 0.1
-        longest = max(len(line) for one in texts.marks for line in one.get_label().split('\n'))
-        marks_columns = max(1, int((WIDTH - 2.0 * EDGE) / (0.55 + LETTER * longest)))
+        marks_columns = max(1, int((WIDTH - 2.0 * EDGE) / marks_width))
         bottom += LINE * math.ceil(marks_lines / marks_columns) + 0.15
     paper = _Paper(drawing, bottom + EDGE + NOTE_LINE * len(texts.notes))
     for index, text in enumerate(texts.header):

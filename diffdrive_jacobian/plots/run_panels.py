@@ -108,11 +108,13 @@ def window(timelines: Sequence[Timeline]) -> tuple[float, float]:
     return min(begins) - margin, max(ends) + margin
 
 
-def draw(panel: Axes, one: Timeline, quantity: str, color: str, style: Any, *, alone: bool) -> bool:
+def draw(
+    panel: Axes, one: Timeline, quantity: str, color: str, style: Any, *, alone: bool
+) -> set[float]:
     """Draw a quantity and, where it comes near them, its limits; of a single run its commands.
 
     Returns:
-        Whether a limit was drawn.
+        The limits that were drawn, in the unit of the quantity.
     """
     shift = np.array([zero(one), 0.0])
     panel.axhline(0.0, color='#bbbbbb', lw=0.8, zorder=1)
@@ -127,12 +129,12 @@ def draw(panel: Axes, one: Timeline, quantity: str, color: str, style: Any, *, a
     if quantity == 'bearing_error' and np.isfinite(one.goal_heading_error).any():
         error = measured(one, 'goal_heading_error') - shift
         panel.plot(*error.T, color=color, ls=HEADING, lw=2.2)
-    drawn = False
+    drawn = set()
     for bound in limits(one).get(quantity, ()):
         if _is_near(bound[:, 1], [command[:, 1], measurement[:, 1]]):
             line = (bound - shift).T
             panel.plot(*line, color='black', ls=LIMIT, lw=1.0, drawstyle='steps-post', zorder=3)
-            drawn = True
+            drawn |= {float(limit) for limit in bound[:, 1] if np.isfinite(limit)}
     return drawn
 
 
@@ -187,12 +189,20 @@ def mark_faults(
         for time in times:
             panel.axvline(time, zorder=4, **style)
     handles = [
-        Line2D([], [], color=color, alpha=2.0 * FAULT_ALPHA, lw=6.0, label=fault_label(span.fault))
+        Line2D([], [], color=color, alpha=2.0 * FAULT_ALPHA, lw=6.0, label=_label(span, zero(one)))
         for span, color in spans[:NAMED]
     ]
     if len(spans) > NAMED:
         handles[-1].set_label(f'and {len(spans) - NAMED + 1} more faults')
-    return handles + [Line2D([], [], label=fault_label(one.label), **style) for one in violations]
+    labels = [
+        f'{time:.1f} s: {fault_label(mark.label)}' for time, mark in zip(times, violations, strict=True)
+    ]
+    return handles + [Line2D([], [], label=label, **style) for label in labels]
+
+
+def _label(span: FaultSpan, start: float) -> str:
+    """Return when a fault was there on the axis of time, and itself, in the time of its world."""
+    return f'{span.begin - start:.1f} to {span.end - start:.1f} s: {fault_label(span.fault)}'
 
 
 def fault_label(name: str) -> str:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import textwrap
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence, Set
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,25 +71,24 @@ def run_figure(runs: Run | Sequence[Run], violations: Sequence[ViolationMark] = 
     axes, *others = (drawing.add_axes((0.0, 0.0, 1.0, 1.0), label=name) for name in ('plane', *names))
     panels = dict(zip(names, others, strict=True))
     plane = Plane(axes, bounds, arrangement.plane_width, timelines)
-    if alone is not None:
-        draw_uncertainty(axes, uncertain)
-    limited = False
+    ellipses = draw_uncertainty(axes, uncertain)
+    limits: dict[str, set[float]] = {name: set() for name in names}
     styles = [*zip(timelines, cycle(COLORS), cycle(STYLES), strict=False)]
     for one, color, style in styles:
         plane.planned_paths(one)
-        plane.path(one, color, style)
+        plane.path(one, color, style, alone=alone is not None)
         plane.ground_truth(one.run, COLOR if alone else color)
         for name, panel in panels.items():
-            limited |= run_panels.draw(panel, one, name, color, style, alone=alone is not None)
+            limits[name] |= run_panels.draw(panel, one, name, color, style, alone=alone is not None)
     plane.goals(timelines)
-    marks = _marks(timelines, plane, limited=limited)
-    marks += uncertainty_marks(alone.run) if alone and uncertain else []
+    marks = _marks(timelines, plane, limited=any(limits.values()))
+    marks += uncertainty_marks(alone.run, ellipses=ellipses) if alone and uncertain else []
     if alone is not None:
         for panel in panels.values():
             for change in run_panels.goal_changes(alone):
                 panel.axvline(change, color=GREY, lw=0.9, ls=':', zorder=1)
         marks += run_panels.mark_faults(panels.values(), alone, violations)
-    _finish(panels, timelines)
+    _finish(panels, timelines, limits)
     labels = names_of([run.path for run in runs])
     header, entries = _header(labels, [summary(one) for one in timelines])
     samples = [
@@ -114,36 +112,44 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 def _header(labels: Sequence[str], found: Sequence[RunSummary]) -> tuple[list[str], list[str]]:
     """Return the lines above the figure: its title, and of several runs one for each.
 
-    The law and those gains that all runs have stand in the title.
+    The laws and those gains that all runs have stand in the title.
     """
-
-    def wrapped(law: str, gains: Mapping[str, str]) -> list[str]:
-        return [part for text in _law(law, gains, 'control law ') for part in wrap(text)]
-
-    wrap = partial(textwrap.wrap, width=HEADER_WIDTH, subsequent_indent='    ')
+    laws = found[0].laws
+    same = all([*one.laws] == [*laws] for one in found)
     common = {
-        name: text
-        for name, text in found[0].gains.items()
-        if all(one.law == found[0].law and one.gains.get(name) == text for one in found)
+        name: {
+            gain: text
+            for gain, text in gains.items()
+            if all(one.laws[name].get(gain) == text for one in found)
+        }
+        for name, gains in (laws if same else {}).items()
     }
-    laws = {one.law for one in found}
+    header = [
+        part
+        for name, gains in common.items()
+        for part in textwrap.wrap(f'control law {_law(name, gains)}', HEADER_WIDTH)
+    ]
     names = [_plain(name) for name in labels]
     if len(found) == 1:
-        return [f'{names[0]}: {found[0].described}', *wrapped(found[0].law, common)], []
+        return [f'{names[0]}: {found[0].described}', *header], []
     entries = []
-    for name, one in zip(names, found, strict=True):
-        own = {gain: text for gain, text in one.gains.items() if gain not in common}
-        law = _law('' if len(laws) == 1 else one.law, own)
-        entry = ': '.join([name, '; '.join([one.described, *law])])
+    for label, one in zip(names, found, strict=True):
+        own = [
+            _law(
+                '' if same else name,
+                {gain: text for gain, text in gains.items() if gain not in common.get(name, {})},
+            )
+            for name, gains in one.laws.items()
+        ]
+        entry = f'{label}: {"; ".join(filter(None, [one.described, *own]))}'
         entries.append(textwrap.shorten(entry, ENTRY_WIDTH, placeholder=' …'))
-    return wrapped(found[0].law if len(laws) == 1 else '', common), entries
+    return header, entries
 
 
-def _law(name: str, gains: Mapping[str, str], what: str = '') -> list[str]:
-    """Return a text about a law and gains; none if there is nothing to say."""
+def _law(name: str, gains: Mapping[str, str]) -> str:
+    """Return a text about a law and gains; '': there is nothing to say."""
     values = ', '.join(f'{gain} = {text}' for gain, text in gains.items()).replace('^2', '²')
-    name = f'{what}{_plain(name)}' if name else ''
-    return [': '.join(filter(None, [name, values]))] if name or values else []
+    return ': '.join(filter(None, [_plain(name), values]))
 
 
 def _plain(text: str) -> str:
@@ -173,11 +179,15 @@ def _time_label(timelines: Sequence[Timeline]) -> str:
     return f'time since {since} [s]'
 
 
-def _finish(panels: dict[str, Axes], timelines: Sequence[Timeline]) -> None:
-    """Set titles and limits of the panels. The wheels share their scale."""
+def _finish(
+    panels: Mapping[str, Axes], timelines: Sequence[Timeline], limits: Mapping[str, Set[float]]
+) -> None:
+    """Set titles, with the limits that were drawn, and scales of the panels, which the wheels share."""
     first, last = run_panels.window(timelines)
     for name, panel in panels.items():
-        panel.set_title(LABELS[name], loc='left', fontsize=9.5, pad=4.0)
+        bounds = ' and '.join(f'{limit:.3g}' for limit in sorted(limits[name])[:2])
+        title = LABELS[name] + (f', limit {bounds}' if bounds else '')
+        panel.set_title(title, loc='left', fontsize=9.5, pad=4.0)
         panel.ticklabel_format(axis='y', style='plain', useOffset=False)
         panel.set_xlim(first, last)
     if 'right' in panels:
@@ -214,7 +224,7 @@ def _marks(timelines: Sequence[Timeline], plane: Plane, *, limited: bool) -> lis
         truth = {'color': COLOR if alone else GREY}
         mark('where the robot truly was', marker='D', ms=5, mfc='white', mew=1.5, **TRUTH, **truth)
     if alone and any(len(commanded(timelines[0], quantity)) for quantity in LABELS):
-        mark('measured: odometry and joint states', lw=1.5)
+        mark('measured by the wheels (odom, joint_states)', lw=1.5)
         mark('commanded', lw=4.5, color=COMMAND)
     if any(np.isfinite(one.goal_heading_error).any() for one in timelines):
         mark('heading error at the goal', ls=HEADING, lw=2.2)

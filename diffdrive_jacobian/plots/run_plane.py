@@ -95,24 +95,24 @@ class Plane:
         axes.set_autoscale_on(False)
         self.headings = False
         """Whether the heading of a goal was drawn, because it counts."""
-        self._robots: list[tuple[Array, float]] = []
 
-    def path(self, one: Timeline, color: str, style: Any) -> None:
-        """Draw the path with evenly spaced headings, and the robot at its start and its end."""
+    def path(self, one: Timeline, color: str, style: Any, *, alone: bool) -> None:
+        """Draw the path with evenly spaced headings, and the robot at its start and its end.
+
+        Of several runs the robots have outlines only, so that all can be seen.
+        """
         axes, poses, travelled = self.axes, one.run.odometry.values[:, :3], one.travelled()
         axes.plot(*line(poses[:, :2], one.breaks).T, color=color, ls=style, lw=1.8)
         evenly = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], ARROWS + 1)[1:-1])
+        evenly = evenly if self.to_scale else np.append(evenly, len(travelled) - 1)
         x, y, theta = poses[np.unique(evenly)].T
         axes.quiver(x, y, np.cos(theta), np.sin(theta), color=color, zorder=3, scale=5.0, **_ARROW)
         starts, robot = poses[[0, *one.breaks[:MARKED]]], size(one.run)
         if self.to_scale and robot is not None:
             for pose in starts:
                 self._robot(pose, robot, ec=color, fc='white', alpha=0.6, zorder=1.0, ls='--')
-            self._robot(poses[-1], robot, ec=color, fc=color, alpha=0.4, zorder=1.05)
-            x, y, theta = poses[-1]
-            # The body is ahead of the axle.
-            ahead = 0.22 * robot.separation * np.array([np.cos(theta), np.sin(theta)])
-            self._robots.append((poses[-1, :2] + ahead, 0.66 * robot.separation))
+            filled: Any = {'fc': color, 'alpha': 0.4} if alone else {'fc': 'none', 'lw': 1.8}
+            self._robot(poses[-1], robot, ec=color, zorder=1.05, **filled)
             return
         axes.plot(*starts[:, :2].T, 'o', ms=9, mfc='white', mec=color, mew=1.8, zorder=2.5)
         axes.plot(*poses[-1, :2], 's', ms=7, mfc=color, mec='white', mew=0.8, zorder=5)
@@ -175,45 +175,32 @@ class Plane:
 
     def _label(self, names: Sequence[str], places: Array, occupied: Array) -> None:
         """Write names beside places, where the fewest other points are, and apart from each other."""
+        from matplotlib.patheffects import withStroke
+
         there: list[Array] = []
+        low, high = self._scale * self._bounds
         # Of a label, and from its place (inches).
         width, height, gap = 0.075 * max(map(len, names)), 0.17, 0.09
-        with np.errstate(invalid='ignore'):
-            for name, place in zip(names, places, strict=True):
-                best: tuple[float, Array] | None = None
-                for far, right, up in product((gap, *self._around(place)), (1, -1, 0), (1, -1, 0)):
-                    side = np.array([right, up])
-                    middle = self._scale * place + side * (far + 0.5 * np.array([width, height]))
-                    apart = [(np.abs(middle - one) >= (width, height)).any() for one in there]
-                    if not side.any() or not all(apart):
-                        continue
+        half = np.array([width, height]) / 2.0
+        for name, place in zip(names, places, strict=True):
+            best: tuple[float, Array] | None = None
+            for far, right, up in product((gap, 3.0 * gap), (1, -1, 0), (1, -1, 0)):
+                side = np.array([right, up])
+                middle = self._scale * place + side * (far + half)
+                apart = [(np.abs(middle - one) >= (width, height)).any() for one in there]
+                if not side.any() or not all(apart):
+                    continue
+                with np.errstate(invalid='ignore'):
                     on_it = np.abs(self._scale * occupied - middle) < (0.6 * width, 0.8 * height)
-                    near = np.hypot(*(self._scale * places - middle).T) < 0.5 * width
-                    # Corners first: a label beside a goal is crossed by a path along an axis.
-                    cost = np.count_nonzero(on_it.all(axis=1)) + 50.0 * np.count_nonzero(near)
-                    cost += 0.5 * (not side.all()) + 2.0 * far
-                    cost += 100.0 * self._is_hidden(middle, np.array([width, height]) / 2.0)
-                    if best is None or cost < best[0]:
-                        best = cost, middle
-                if best is not None:
-                    there.append(best[1])
-                    x, y = best[1] / self._scale
-                    self.axes.text(x, y, name, ha='center', va='center', zorder=7)
-
-    def _around(self, place: Array) -> list[float]:
-        """Return how far outside of a robot is that stands at a place (inches)."""
-        return [
-            self._scale * radius
-            for centre, radius in self._robots
-            if np.hypot(*(place - centre)) < radius
-        ]
-
-    def _is_hidden(self, middle: Array, half: Array) -> bool:
-        """Return whether a label is on a robot or outside, by its middle and half its size (inches)."""
-        low, high = self._scale * self._bounds
-        outside = bool((middle - half < low).any() or (middle + half > high).any())
-        return outside or any(
-            np.hypot(*np.maximum(np.abs(middle - self._scale * centre) - half, 0.0))
-            < self._scale * radius
-            for centre, radius in self._robots
-        )
+                near = np.hypot(*(self._scale * places - middle).T) < 0.5 * width
+                outside = (middle - half < low).any() or (middle + half > high).any()
+                # Corners first: a label beside a goal is crossed by a path along an axis.
+                cost = np.count_nonzero(on_it.all(axis=1)) + 50.0 * np.count_nonzero(near)
+                cost += 0.5 * (not side.all()) + 9.0 * (far > gap) + 100.0 * outside
+                if best is None or cost < best[0]:
+                    best = cost, middle
+            if best is not None:
+                there.append(best[1])
+                halo = [withStroke(linewidth=2.0, foreground='white')]
+                x, y = best[1] / self._scale
+                self.axes.text(x, y, name, ha='center', va='center', zorder=7, path_effects=halo)

@@ -38,9 +38,11 @@ GRID = 121
 SMALLEST = 1e-4
 """Size below which a region is not drawn (m)."""
 FILL, OUTLINE, ELLIPSE = '#c9b8ef', '#7a4fd0', '#7f7f7f'
-REGION_LABEL = 'the robot is truly in here with 95 %'
-SLIPPING = f'{REGION_LABEL}, if\nits wheels slip by wheel_travel_variance'
-ELLIPSE_LABEL = 'the same by the covariance of odom alone'
+REGION_LABEL = 'the robot truly is in here with 95 %'
+SLIPPING = f'{REGION_LABEL}, if\nits wheels slip (wheel_travel_variance {{:g}} m)'
+ELLIPSE_LABEL = 'what the covariance in odom says alone'
+DIFFERENCE = 0.3
+"""Least difference of an ellipse from the region, as a part of its size, for it to be drawn."""
 
 
 class Uncertainty(NamedTuple):
@@ -74,8 +76,9 @@ def uncertainties(one: Timeline, places: int = PLACES) -> list[Uncertainty]:
     return found
 
 
-def draw_uncertainty(plane: Axes, found: Sequence[Uncertainty]) -> None:
-    """Draw regions along a path, and the ellipses."""
+def draw_uncertainty(plane: Axes, found: Sequence[Uncertainty]) -> bool:
+    """Draw regions along a path, and those ellipses that differ from them; return whether one does."""
+    drawn = False
     for uncertainty in found:
         (left, low), (right, high) = uncertainty.extent
         size = max(right - left, high - low)
@@ -89,19 +92,25 @@ def draw_uncertainty(plane: Axes, found: Sequence[Uncertainty]) -> None:
         edge = float(np.sqrt(uncertainty.region.level))
         plane.contourf(x, y, root, [0.0, edge], colors=[FILL], alpha=0.5, zorder=1.2)
         plane.contour(x, y, root, [edge], colors=[OUTLINE], linewidths=0.9, zorder=1.3)
-        plane.plot(*_ellipse(uncertainty).T, color=ELLIPSE, lw=0.9, ls='--', zorder=1.4)
+        ellipse = _ellipse(uncertainty)
+        apart = np.sqrt(region_distance(uncertainty.region, ellipse)) / edge - 1.0
+        if np.abs(apart).max() > DIFFERENCE:
+            drawn = True
+            plane.plot(*ellipse.T, color=ELLIPSE, lw=0.9, ls='--', zorder=1.4)
+    return drawn
 
 
-def uncertainty_marks(run: Run) -> list[Patch | Line2D]:
-    """Return the legend of the regions and the ellipses."""
+def uncertainty_marks(run: Run, *, ellipses: bool) -> list[Patch | Line2D]:
+    """Return the legend of the regions and, if there are any, the ellipses."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    ours = 'wheel_travel_variance' in run.of_node('virtual_robot')
-    return [
-        Patch(fc=FILL, ec=OUTLINE, alpha=0.7, label=SLIPPING if ours else REGION_LABEL),
-        Line2D([], [], color=ELLIPSE, lw=0.9, ls='--', label=ELLIPSE_LABEL),
-    ]
+    variance = run.number_of_node('virtual_robot', 'wheel_travel_variance', np.nan)
+    label = REGION_LABEL if np.isnan(variance) else SLIPPING.format(variance)
+    marks: list[Patch | Line2D] = [Patch(fc=FILL, ec=OUTLINE, alpha=0.7, label=label)]
+    if ellipses:
+        marks.append(Line2D([], [], color=ELLIPSE, lw=0.9, ls='--', label=ELLIPSE_LABEL))
+    return marks
 
 
 def _of_wheels(covariances: Array, breaks: Indices) -> bool:

@@ -47,7 +47,7 @@ def test_faults_are_bands_over_time_and_many_are_counted(tmp_path):
     # To the end of the run.
     assert spans[1][1:] == pytest.approx((2.0, 3.98))
     drawing = run_figure([run])
-    assert labels(drawing) == [loss, kill]
+    assert labels(drawing) == [f'1.0 to 1.5 s: {loss}', f'2.0 to 4.0 s: {kill}']
     plane, *panels = drawing.axes
     assert not plane.patches
     for panel in panels:

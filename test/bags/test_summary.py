@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from support.bags import changed, status, write_bag
+from support.bags import changed, odom, status, write_bag
 from support.ros_messages import goal, goals, path
 from support.runs import STRAIGHT, sample
 
@@ -67,8 +67,8 @@ def test_the_outcome_of_the_last_goal_or_path(tmp_path, messages, outcome, secon
     found = summed(tmp_path, *messages)
     assert found.outcome == outcome
     assert (found.seconds, found.length) == pytest.approx((seconds, length), abs=1e-6)
-    words = {'no goal': '', 'refused': 'refused, ', 'not arrived': 'not arrived within '}
-    expected = f'{words.get(outcome, f"{outcome} after ")}{seconds:.1f} s, {length:.2f} m'
+    words = {'no goal': 'no goal, ', 'refused': 'refused, ', 'not arrived': 'not arrived within '}
+    expected = f'{words.get(outcome, f"{outcome} after ")}{seconds:.1f} s, {length:.2f} m driven'
     assert found.described == expected
 
 
@@ -104,21 +104,42 @@ def test_the_law_is_the_one_that_drove_with_the_gains_that_it_had(tmp_path):
         sent = sorted([*messages, *more], key=lambda one: one[0])
         folder = tmp_path / str(len(list(tmp_path.iterdir())))
         found = summed(folder, *sent, parameters={'/go_to_goal': own})
-        return found.law, dict(found.gains)
+        return {name: dict(gains) for name, gains in found.laws.items()}
 
     gains = {'kp': '1 1/s', 'kv': '2 1/s'}
-    assert law() == ('go_to_goal', gains)
+    assert law() == {'go_to_goal': gains}
     # Before the first goal, and after the end.
     before, after = changed('/go_to_goal', 'kp', 5.0), changed('/go_to_goal', 'controller', 'pose')
-    assert law((10.5, before), (12.5, after)) == ('go_to_goal', {**gains, 'kp': '5 1/s'})
+    assert law((10.5, before), (12.5, after)) == {'go_to_goal': {**gains, 'kp': '5 1/s'}}
     # Meanwhile: the first and the last one.
     changes = [(11.1 + 0.01 * k, changed('/go_to_goal', 'kp', 2.0 + k)) for k in range(40)]
-    assert law(changes[0]) == ('go_to_goal', {**gains, 'kp': '1 1/s, then 2 1/s'})
-    assert law(*changes) == ('go_to_goal', {**gains, 'kp': '1 1/s, ..., 41 1/s'})
+    assert law(changes[0]) == {'go_to_goal': {**gains, 'kp': '1 1/s, then 2 1/s'}}
+    assert law(*changes) == {'go_to_goal': {**gains, 'kp': '1 1/s, ..., 41 1/s'}}
     along = [(10.0, ALONG), (10.0, status(2)), (12.0, status(4))]
-    assert law(messages=along) == ('kanayama', {'k_x': '3 1/s', 'k_y': '4 1/m^2'})
-    assert law(messages=[]) == ('', {})
-    assert summed(tmp_path / 'bare', *reached).law == ''
+    kanayama = {'k_x': '3 1/s', 'k_y': '4 1/m^2'}
+    assert law(messages=along) == {'kanayama': kanayama}
+    assert law(messages=[]) == {}
+    assert summed(tmp_path / 'bare', *reached).laws == {}
+    # A path after a goal, and a goal after a path.
+    both = [*along, (12.5, goal(9, 0)), (12.5, status(2))]
+    assert [*law(messages=both).items()] == [('kanayama', kanayama), ('go_to_goal', gains)]
+
+
+def test_the_true_distance_says_whose_opinion_the_outcome_is(tmp_path):
+    """By ground truth it stopped earlier."""
+    sent = [
+        (at, '/ground_truth', odom(min(0.4, 0.5 * (at - 10.0)), 0.0, 0.0, seconds=at))
+        for at in np.arange(10.0, 12.0, 0.02).tolist()
+    ]
+    sent += [
+        (10.0, '/goal_pose', ONE),
+        (10.0, '/goal_status', status(2)),
+        (11.0, '/goal_status', status(4)),
+    ]
+    found = summary(timeline(read_run(write_bag(tmp_path / 'run', sample(sent, **STRAIGHT)))))
+    assert found.true_distance == pytest.approx(0.1)
+    assert found.described == 'by odometry arrived after 1.0 s, 0.50 m driven; truly 0.10 m away'
+    assert 'truly' in table_of(['run'], [found])[0]
 
 
 def test_the_table_has_the_columns_that_a_run_has(tmp_path):

@@ -309,6 +309,8 @@ def test_a_long_property_is_cut_and_the_picture_marks_when_it_is_violated(tmp_pa
     assert re.fullmatch(r'"""StaysNear.{1,200}\.\.\. is violated at [\d.]+ s\.', title)
     drawing = drawn[found.index(short)]
     (legend,) = drawing.legends
-    assert legend.get_texts()[-1].get_text() == f'violated: {fast!r}'
+    time, _, said = legend.get_texts()[-1].get_text().partition(' s: ')
+    assert said == f'violated: {fast!r}'
+    assert float(time) == pytest.approx(short.violation.seconds, abs=0.1)
     (mark,) = (line for line in drawing.axes[1].lines if line.get_color() == VIOLATION)
     assert mark.get_xdata()[0] == pytest.approx(short.violation.seconds, abs=0.05)

@@ -13,7 +13,7 @@ from support.runs import built_run, series
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.plots import run_figure
-from diffdrive_jacobian.plots.uncertainty import ELLIPSE_LABEL, REGION_LABEL, uncertainties
+from diffdrive_jacobian.plots.uncertainty import ELLIPSE, ELLIPSE_LABEL, REGION_LABEL, uncertainties
 from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
 from diffdrive_jacobian.simulation.pose_region import (
@@ -121,10 +121,15 @@ def test_the_regions_along_a_path_hold_95_percent_of_the_robots():
 
 
 def test_the_figure_has_the_region_and_the_ellipse():
-    drawn = run_figure([driven([((0.22, 0.0), 10.0)], rate=5)])
+    drawn = run_figure(driven([((0.22, 0.0), 2.0)], rate=5))
     labels = [text.get_text() for text in drawn.legends[0].get_texts()]
     assert REGION_LABEL in labels
-    assert ELLIPSE_LABEL in labels
+    # Where it says the same it is not drawn.
+    assert ELLIPSE_LABEL not in labels
+    assert not [one for one in drawn.axes[0].lines if one.get_color() == ELLIPSE]
+    far = run_figure(driven([((0.22, 0.0), 10.0)], rate=5))
+    assert ELLIPSE_LABEL in [text.get_text() for text in far.legends[0].get_texts()]
+    assert [one for one in far.axes[0].lines if one.get_color() == ELLIPSE]
 
 
 def test_covariances_that_are_not_of_wheels_are_not_drawn():

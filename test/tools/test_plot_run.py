@@ -75,8 +75,8 @@ def odometry_only(path, **how):
 
 
 def by_label(made):
-    """Return the panels over time by their titles."""
-    return {one.get_title(loc='left'): one for one in made.axes[1:]}
+    """Return the panels over time by their titles, without limits."""
+    return {one.get_title(loc='left').partition(', limit')[0]: one for one in made.axes[1:]}
 
 
 def drawn(axes, color=COLORS[0]):
@@ -125,7 +125,7 @@ def test_the_axes_show_the_run_with_units(run):
     assert line.get_drawstyle() == 'steps-post'
     values = [[0.0, 0.5], [1.5, 0.25], [199 / RATE - 0.5, 0.25]]
     assert np.column_stack(line.get_data()) == pytest.approx(np.array(values), abs=1e-9)
-    assert written(made)[0] == 'bag: not arrived within 3.5 s, 1.74 m'
+    assert written(made)[0] == 'bag: not arrived within 3.5 s, 1.74 m driven'
 
 
 def test_limits_are_drawn_where_they_are_near(run):
@@ -134,6 +134,8 @@ def test_limits_are_drawn_where_they_are_near(run):
         lines = by_label(made)[LABELS['v']].lines
         found = {one.get_ydata()[0] for one in lines if one.get_color() == 'black'}
         assert ('limit' in legends(made)) == bool(found)
+        title = by_label(made)[LABELS['v']].get_title(loc='left')
+        assert title.partition(', limit ')[2] == ' and '.join(f'{one:g}' for one in sorted(found))
         return found
 
     # It drives with 0.5 m/s.
@@ -218,7 +220,8 @@ def test_the_plane_has_goals_headings_and_planned_paths(tmp_path):
     assert (heading.U[0], heading.V[0]) == pytest.approx((math.cos(1.5), math.sin(1.5)))
     # The others are along the path, which the robot drives at 0.5 rad/s.
     (along,) = (one for one in arrows if len(one.U) > 1)
-    assert len(along.U) == ARROWS - 1
+    # The last one is the end, where the robot is not drawn.
+    assert len(along.U) == ARROWS
     assert np.unwrap(np.arctan2(along.V, along.U)).max() < 2.0
     (path,) = (one for one in plane.lines if one.get_color() == PLANNED)
     assert path.get_xydata()[[0, -1]].tolist() == [[0.0, 0.0], [1.0, 0.5]]
