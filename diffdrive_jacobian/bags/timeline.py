@@ -291,8 +291,10 @@ def _along_paths(
         run.number_of_node('go_to_goal', name, getattr(defaults, name))
         for name in ('path_approach_distance', 'odom_timeout')
     )
+    before: tuple[Array, Indices] | None = None
     for which_route, (sent, followed) in enumerate(routes):
         if not sent.is_path:
+            before = None
             continue
         rows = run.planned_path.values[sent.rows.start : sent.rows.stop]
         try:
@@ -301,6 +303,11 @@ def _along_paths(
             # The node refuses it, too.
             continue
         here = np.flatnonzero(driven == which_route)
+        if before is not None and np.array_equal(before[0], rows, equal_nan=True):
+            # On the same path the node goes on where it is.
+            here = np.concatenate([before[1], here])
+            paths.pop()
+        before = rows, here
         s = path.project(poses[here])
         if followed.state is GoalState.UNKNOWN:
             left = np.hypot(*(poses[here, :2] - path.poses[-1, :2]).T)

@@ -31,7 +31,7 @@ from diffdrive_jacobian.live.commands import (
     SetParameter,
 )
 from diffdrive_jacobian.live.hand import DEAD_MAN, STANDSTILL, Act, HandDriving
-from diffdrive_jacobian.live.robot_state import GoalEnd, RobotState
+from diffdrive_jacobian.live.robot_state import GoalEnd, GoalProgress, RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
 from diffdrive_jacobian.live.session import Session
 from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, PATH, POSE, Motion, Route, Status
@@ -326,7 +326,9 @@ class LiveRobot:
     def drive(self) -> None:
         """Drive by hand, if a page does; to be called often."""
         clocks = time.monotonic(), self._now() / NANOSECONDS
-        act = self.hand.update(*clocks, self._session.is_open, self.state.goal.active)
+        # Nobody cancels the goal of a controller that has ended.
+        active = self.state.goal.active and self.state.controlled
+        act = self.hand.update(*clocks, self._session.is_open, active)
         if act is Act.PUBLISH:
             self.topics.publish_twist(self.hand.twist, self._now())
         elif act in (Act.STOP, Act.EXPIRE):
@@ -430,6 +432,9 @@ class LiveRobot:
                 continue
             if link is not None:
                 link.destroy()
+                if role == 'controller':
+                    # What the one before drove to ended with it.
+                    self.state.goal = GoalProgress()
             link = self.links[role] = ParameterLink(self._node, name, gid)
             if role == 'robot':
                 self.state.robot_values = link.values

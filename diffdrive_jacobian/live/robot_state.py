@@ -174,8 +174,13 @@ class GoalProgress:
         if shown is not None and shown.goal is not None and shown.stamp == stamp != UNSTAMPED:
             # Those that this program has sent come back by their topic.
             return
-        if len(poses_of(goals)):
-            self._show(self._follower.sent(goals, stamp))
+        if not len(poses_of(goals)):
+            return
+        followed = self._follower.sent(goals, stamp)
+        if followed is shown:
+            # Its status came first.
+            self._use(goals)
+        self._show(followed)
 
     def reported(self, status: int, stamp: Stamp) -> FollowedGoal[Goals | Path] | None:
         """Take a status of a controller. Return the goals of which something else became, or None."""

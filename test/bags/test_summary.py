@@ -88,6 +88,18 @@ def test_greatest_values_are_those_of_the_time_between_start_and_end(tmp_path):
     assert math.isnan(found.distance)
 
 
+def test_a_path_that_is_sent_again_goes_on(tmp_path):
+    """As planners do; also its times."""
+    along = path((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), times=[0.0, 4.0])
+    sent = [(10.0, along), (10.0, status(2)), (11.0, along), (11.0, status(5)), (11.0, status(2))]
+    sent = [(at, TOPICS[type(one).__name__], one) for at, one in sent]
+    one = timeline(read_run(write_bag(tmp_path / 'run', sample(sent, **STRAIGHT))))
+    assert len(one.paths) == 1
+    np.testing.assert_allclose(one.along[1:-1], 0.0, atol=1e-9)
+    np.testing.assert_allclose(one.late[1:-1], 0.0, atol=1e-9)
+    np.testing.assert_allclose(one.elapsed[1:-1], one.time[1:-1], atol=1e-9)
+
+
 def test_the_law_is_the_one_that_drove_with_the_gains_that_it_had(tmp_path):
     own = {
         'controller': 'go_to_goal',

@@ -29,6 +29,7 @@ from diffdrive_jacobian.live.commands import (
 )
 from diffdrive_jacobian.live.node import LivePage
 from diffdrive_jacobian.live.session import Session
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
@@ -342,6 +343,13 @@ def test_a_node_that_changes_its_name_leaves_nothing_behind(driven):
         robot.use_nodes({'robot': ('/virtual_robot', gid)})
         assert (robot.links['robot'] is link) == (gid == b'')
     assert not robot.state.controlled
+    # What the controller before drove to ended with it.
+    robot.use_nodes({'controller': ('/go_to_goal', b'')})
+    robot.state.goal.reported(GoalState.EXECUTING, (1, 0))
+    for gid in (b'', b'again'):
+        assert robot.state.goal.active
+        robot.use_nodes({'controller': ('/go_to_goal', gid)})
+    assert not robot.state.goal.active
     robot.destroy()
     assert not list(driven.node.clients)
 

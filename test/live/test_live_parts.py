@@ -427,6 +427,16 @@ def test_the_progress_on_a_path_outlives_a_refused_goal_and_the_same_path_again(
         assert goal.path.s == pytest.approx(0.4)
 
 
+def test_a_path_whose_status_comes_first_is_a_path():
+    goal = GoalProgress()
+    goal.reported(GoalState.ACCEPTED, (1, 0))
+    assert goal.shown()['goals'] is None
+    goal.sent(line_path(4.0), (1, 0))
+    goal.reported(GoalState.EXECUTING, (1, 0))
+    assert len(goal.shown()['path']) > 100
+    assert goal.path is not None
+
+
 def test_through_waypoints_without_a_stop_the_law_of_paths_drives():
     state = RobotState('/')
     state.controller_values = {

@@ -3,12 +3,14 @@
 import { element, format, math, plain, setMath, setText } from './dom.js';
 
 const LAWS = {
+  __proto__: null,
   go_to_goal: ['v = K_v d cos e,  ω = K_p e', 'A (9)–(11)'],
   pose: ['v = K_v ρ cos α,  ω = K_p α + K_v cos α (sin α / α)(α + h φ)', 'Aicardi 1995'],
   offset_point: ['w = J_d⁻¹ k (p_{goal} − p_d)', 'B'],
 };
 const GOAL = 'd = |p_{goal} − p|,  e = ∠(p_{goal} − p) − θ';
 const PATH_LAWS = {
+  __proto__: null,
   pure_pursuit: ['v = v_r,  ω = 2 v y / l_d²', 'Coulter 1992'],
   kanayama: ['v = v_r cos e_{θ} + k_x e_x,  ω = ω_r + v_r (k_y e_y + k_{θ} sin e_{θ})', 'Kanayama 1990'],
   offset_point: ['w = J_d⁻¹ (ṗ_r + k (p_r − p_d))', 'B'],
