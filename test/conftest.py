@@ -18,7 +18,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 os.environ.setdefault('ROS_LOG_DIR', os.path.join(os.environ.get('TMPDIR', '/tmp'), 'ros_test_log'))
 
 import pytest
-from fork_server import forked
 from support.harness import Harness
 
 pytest_plugins = ['pytester']
@@ -29,26 +28,8 @@ for number in (signal.SIGHUP, signal.SIGINT):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, lambda *_: None)
 
-LONGEST_FIRST = (
-    *('test_pages', 'test_explored_nodes', 'test_forked', 'test_damage_fuzz', 'test_processes'),
-    *('test_replay_run', 'test_recover_crash', 'test_calibrate_run', 'test_exploration'),
-    *('test_external', 'test_external_failures', 'test_own_controllers', 'test_fixtures'),
-    *('test_process_faults', 'test_record_run', 'test_live_browser', 'test_flood', 'test_calibration'),
-    *('test_faults_same', 'test_faulty_drives'),
-)
-"""Files with tests that take seconds. They start first, so that none is left for the end."""
-SLOW = {
-    *('test_calibrate_run', 'test_calibration', 'test_cdr', 'test_closed_loop'),
-    *('test_damage_fuzz', 'test_defective_controllers', 'test_drives', 'test_exploration'),
-    *('test_exploration_output', 'test_exploration_strategies', 'test_explored_nodes'),
-    *('test_faulty_drives', 'test_fixtures', 'test_go_to_goal_paths', 'test_golden_run'),
-    *('test_ground_truth', 'test_hostile_bags', 'test_live_node', 'test_lockstep_failures'),
-    *('test_options', 'test_own_controllers', 'test_own_gains', 'test_paths_driven'),
-    *('test_plot_run', 'test_properties_nodes', 'test_recover', 'test_replay_run'),
-    *('test_sweep_gains', 'test_three_nodes', 'test_timeline', 'test_verification'),
-    *('test_virtual_robot', 'test_virtual_robot_commands'),
-}
-"""Files that are marked as slow as a whole: their tests take more than a second of CPU time together."""
+COST = ('pages', 'browser', 'process', 'slow')
+"""Marks of tests that are not quick. The dearest start first, so that none is left for the end."""
 MEMORY = 700 << 20
 """What a test with `bounded_memory` may take (bytes)."""
 CHUNK = 4
@@ -61,15 +42,7 @@ def pytest_xdist_auto_num_workers():
     return len(os.sched_getaffinity(0)) + 2
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_configure_node(node):
-    """Let the workers of pytest-xdist share their servers of forks."""
-    node.workerinput['forks'] = forked.share()
-
-
 def pytest_configure(config):
-    if hasattr(config, 'workerinput'):
-        forked.use(config.workerinput['forks'])
     if getattr(config.option, 'maxschedchunk', CHUNK) is None:
         config.option.maxschedchunk = CHUNK
 
@@ -87,16 +60,22 @@ def pytest_collection():
     gc.set_threshold(20_000, 50, 100)
 
 
+def cost(item):
+    """Return the place of a test in the order in which all start."""
+    return min(
+        (COST.index(mark.name) for mark in item.iter_markers() if mark.name in COST), default=len(COST)
+    )
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_itemcollected(item):
-    if item.path.stem in SLOW:
-        item.add_marker('slow')
+    if cost(item) == len(COST):
+        item.add_marker('quick')
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items):
-    places = {name: place for place, name in enumerate(LONGEST_FIRST)}
-    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
+    items.sort(key=cost)
 
 
 @pytest.fixture(params=['events', 'single'])
@@ -122,12 +101,6 @@ def ros(request):
         harness = Harness(context, executor)
         yield harness
         harness.close()
-
-
-@pytest.fixture(scope='session')
-def forked_python(tmp_path_factory):
-    """Return a command that is used like the Python interpreter, and has done its imports."""
-    return forked.make_commands(tmp_path_factory.mktemp('forked') / 'commands', ['python']) / 'python'
 
 
 @pytest.fixture

@@ -7,8 +7,7 @@
     python test/documentation/pages.py pictures  draw the pictures of plot_jacobian that pages show
 
 A page is run from top to bottom in one empty directory. A `python` block is a program and a `bash` block
-a script. Programs of this package, `pytest` and `python` run in forks, see `forked`. `python3` is a new
-interpreter.
+a script.
 A block of any language whose first line is `# NAME.EXTENSION` is a file. HTML comments before
 a block say what differs:
 
@@ -56,7 +55,6 @@ from unittest import mock
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fork_server import forked
 from support.domains import domain_id
 
 import diffdrive_jacobian
@@ -66,7 +64,6 @@ from diffdrive_jacobian.parameters.nodes import (
     VirtualRobotParameters,
     WheelBridgeParameters,
 )
-from diffdrive_jacobian.tools.entry_points import NODES, tools
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {
@@ -132,16 +129,14 @@ def blocks(text: str) -> list[Block]:
 class Session:
     """A page that is run in a directory."""
 
-    def __init__(self, directory: Path, commands: Path) -> None:
-        """Run in an empty directory, with the commands of this package in another one."""
+    def __init__(self, directory: Path) -> None:
+        """Run in an empty directory."""
         self._directory = directory
         (directory / 'config').symlink_to(ROOT / 'config')
-        scripts = Path(sysconfig.get_path('scripts'))
-        ours = [scripts / name for name in ('pytest', *NODES, *tools())]
-        self._commands = forked.make_commands(commands, ['python', *ours])
+        scripts = sysconfig.get_path('scripts')
         self._environment = {
             **os.environ,
-            'PATH': os.pathsep.join([str(commands), str(scripts), os.environ['PATH']]),
+            'PATH': os.pathsep.join([scripts, os.environ['PATH']]),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
             'ROS_DOMAIN_ID': str(domain_id()),
             'PYTHONUNBUFFERED': '1',
@@ -311,13 +306,12 @@ def refreshed(quoted: Block, printed: str) -> str:
 def run_page(text: str, directory: Path) -> list[tuple[Block, str]]:
     """Run the blocks of a page; return the quoted outputs with what was printed."""
     printed, outputs = '', []
-    with tempfile.TemporaryDirectory() as folder:
-        session = Session(directory, Path(folder) / 'commands')
-        for block in blocks(text):
-            if 'output' in block.notes:
-                outputs.append((block, printed))
-            elif is_run(block):
-                printed = session.run(block)
+    session = Session(directory)
+    for block in blocks(text):
+        if 'output' in block.notes:
+            outputs.append((block, printed))
+        elif is_run(block):
+            printed = session.run(block)
     return outputs
 
 

@@ -8,10 +8,9 @@ import io
 import json
 from typing import NamedTuple
 
-from fork_server import forked
-
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import entry_points
+from support.processes import run_python
 
 COMMANDS = (*entry_points.NODES, *entry_points.tools())
 EACH = """
@@ -87,9 +86,9 @@ def run_each(calls, before='', **kwargs):
     Args:
         calls: Each is a command and its arguments.
         before: A program that runs first.
-        kwargs: As for `forked.run`.
+        kwargs: As for `subprocess.run`.
     """
     text = json.dumps([[str(word) for word in call] for call in calls])
-    ended = forked.run(before + EACH, (text,), timeout=90, **kwargs)
+    ended = run_python(before + EACH, text, **kwargs)
     assert ended.returncode == 0, ended.stderr
     return [Ended(*one) for one in json.loads(ended.stdout)]

@@ -14,8 +14,6 @@ from contextlib import ExitStack, contextmanager
 from functools import cached_property
 from unittest import mock
 
-from fork_server import forked
-
 from diffdrive_jacobian.ros.fastdds_profiles import VARIABLE, announce_frequently
 from support.domains import domain_id
 from support.harness import PATIENCE, Harness
@@ -31,10 +29,23 @@ announce_frequently()
 _numbers = itertools.count()
 
 
+def start_python(program, *arguments, **streams):
+    """Start `python -c PROGRAM ARGUMENTS`."""
+    command = [sys.executable, '-c', program, *map(str, arguments)]
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, **streams)
+
+
+def run_python(program, *arguments, timeout=LIMIT, **options):
+    """Run `python -c PROGRAM ARGUMENTS` to its end; return its exit code and what it printed."""
+    streams = {'stdin': subprocess.DEVNULL, 'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE}
+    command = [sys.executable, '-c', program, *map(str, arguments)]
+    return subprocess.run(command, **{**streams, **options}, text=True, timeout=timeout)
+
+
 class Child:
     """A running entry point; what it prints goes into files, so that no pipe can fill up."""
 
-    def __init__(self, name, arguments, directory, stdout=None, *, fresh=False):
+    def __init__(self, name, arguments, directory, stdout=None):
         self.command = ' '.join([name, *arguments])
         number = next(_numbers)
         self._out, self._err = (directory / f'{number}_{name}.{end}' for end in ('out', 'err'))
@@ -42,12 +53,7 @@ class Child:
             streams = {'stdout': out if stdout is None else stdout, 'stderr': err}
             # Children choose their own profiles: this file may be that of another installation.
             streams['env'] = {name: value for name, value in os.environ.items() if name != VARIABLE}
-            program = PROGRAM.format(name)
-            if fresh:
-                command = [sys.executable, '-c', program, *arguments]
-                self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, **streams)
-            else:
-                self._process = forked.Popen(program, arguments, **streams)
+            self._process = start_python(PROGRAM.format(name), *arguments, **streams)
         self._limit = threading.Timer(LIMIT, self._process.kill)
         self._limit.daemon = True
         self._limit.start()
@@ -119,17 +125,9 @@ class World:
         self._children = []
         self._stack = ExitStack()
 
-    def start(self, name, *arguments, stdout=None, fresh=False):
-        """Start an entry point.
-
-        Args:
-            name: Its name.
-            arguments: Its arguments.
-            stdout: Its standard output, which is not seen then.
-            fresh: Whether it is a new interpreter that has yet to import everything. Otherwise it is
-                forked, see `forked`.
-        """
-        child = Child(name, arguments, self._directory, stdout, fresh=fresh)
+    def start(self, name, *arguments, stdout=None):
+        """Start an entry point with arguments. What goes into a given `stdout` is not seen."""
+        child = Child(name, arguments, self._directory, stdout)
         self._children.append(child)
         return child
 
