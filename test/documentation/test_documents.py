@@ -36,14 +36,12 @@ J_OFFSET = np.array(
 PRINTED = {
     'A S(theta)': (dd.unicycle_jacobian(psi), [[c, 0.0], [s, 0.0], [0.0, 1.0]]),
     'A J_w': (dd.wheel_to_body_jacobian(r, l), [[r / 2, r / 2], [r / l, -r / l]]),
+    'B v_b and psi_dot_b': (dd.wheel_to_body(9.0, 4.0, r, l), [13.0 * r / 2, 5.0 * r / l]),
     # Of its two H_B^w the text kept the planar one; the others have rows of other matrices mixed in.
     'B H_B^W': (se2.homogeneous([3.0, 4.0, psi]), [[c, -s, 3.0], [s, c, 4.0], [0.0, 0.0, 1.0]]),
     'B one wheel': (dd.single_wheel_jacobian(psi, r), [[r * c, 0.0], [r * s, 0.0], [0.0, 1.0]]),
     'B and E in the world': (dd.wheel_to_world_jacobian(psi, r, l)[:, ::-1], J_B),
-    'B position': (
-        dd.wheel_to_position_jacobian(psi, r, l)[:, ::-1],
-        [[r / 2 * c] * 2, [r / 2 * s] * 2],
-    ),
+    'B position': (dd.wheel_to_position_jacobian(psi, r, l), [[r / 2 * c] * 2, [r / 2 * s] * 2]),
     'B offset point': (dd.offset_point_jacobian(psi, r, l, d)[:, ::-1], J_OFFSET),
     'C point on a wheel': (
         contact.wheel_contact_position(0.4, psi, r),
@@ -100,12 +98,10 @@ def test_a_two_links_near_a_singularity_ask_for_impossible_speeds_and_damping_bo
     q = np.column_stack([np.zeros(4), [1.0, 1e-2, 1e-4, 1e-6]])
     fast = np.linalg.norm(arm.inverse_velocity(q, x_dot), axis=-1)
     assert np.all(fast[1:] > 90.0 * fast[:-1])
-    w = iv.manipulability(arm.jacobian(q))
-    factor = iv.damping(w, threshold=0.1, maximum=0.05)
+    factor = iv.damping(iv.manipulability(arm.jacobian(q)), threshold=0.1, maximum=0.05)
     damped = np.linalg.norm(iv.damped_least_squares(arm.jacobian(q), x_dot, factor), axis=-1)
     assert factor[0] == 0.0  # small when w is large, increased as it falls towards zero
     assert np.all(np.diff(factor) > 0.0)
-    close(damped[0], fast[0])
     assert np.all(damped[1:] <= 0.1 / (2.0 * factor[1:]))
 
 
@@ -127,30 +123,14 @@ def test_a_slip_twists_become_wheel_speeds_by_the_inverse_of_equation_8():
 # --- B: lecture slides, "Mobile Robot Jacobians"
 
 
-def test_b_differential_drive_in_left_right_order():
-    left, right = LEFT_RIGHT
-    v_b, psi_dot_b = (right + left) * r / 2.0, (right - left) * r / l
-    close(dd.wheel_to_body(right, left, r, l), [v_b, psi_dot_b])
-    close(J_B @ LEFT_RIGHT, [v_b * c, v_b * s, psi_dot_b])
-
-
 def test_b_position_alone_has_rank_1_no_matter_what_psi_we_put_in_and_the_offset_point_2():
-    J = dd.wheel_to_position_jacobian(HEADINGS, r, l)
-    assert np.all(np.linalg.matrix_rank(J) == 1)
-    assert np.array_equal(J[:, 0, 0] * J[:, 1, 1], J[:, 0, 1] * J[:, 1, 0])  # exactly singular
-    for singular in J:  # "won't work!"
+    for singular in dd.wheel_to_position_jacobian(HEADINGS, r, l):  # "won't work!"
+        assert np.linalg.matrix_rank(singular) == 1
         with pytest.raises(np.linalg.LinAlgError):
             iv.adjugate_inverse(singular)
     # "Can we invert this new Jacobian? Yes!", for every psi; the order of columns turns the sign.
     close(np.linalg.det(dd.offset_point_jacobian(HEADINGS, r, l, d)), -d * r**2 / l)
     assert np.linalg.det(J_OFFSET) > 0.0
-
-
-def test_b_velocities_of_the_offset_point_are_an_ellipse():
-    for at, semi_axes in ((d, (r / 2**0.5, 2**0.5 * d * r / l)), (l / 2, (r / 2**0.5, r / 2**0.5))):
-        found = np.linalg.svd(dd.offset_point_jacobian(psi, r, l, at), compute_uv=False)
-        close(found, sorted(semi_axes, reverse=True))
-    close(np.linalg.svd(dd.wheel_to_position_jacobian(psi, r, l), compute_uv=False), [r / 2**0.5, 0.0])
 
 
 def test_b_slip_the_left_wheel_moves_the_offset_point_to_the_right():
@@ -176,10 +156,9 @@ def test_b_slip_only_the_two_velocities_of_the_point_belong_behind_the_inverse()
 
 def test_c_a_wheel_that_must_not_slip_turns_as_its_body_moves():
     J_F, J_body = contact.wheel_contact_jacobian(contact.AT_GROUND, r), np.array([[1.0, 0.0]])
-    close(J_F @ [r * 5.0, 5.0], 0.0)  # x_dot - r phi_dot = 0
     close(J_F @ contact.rolling_direction(r), 0.0)
     q_dot = iv.prioritized([(J_F, np.zeros(3)), (J_body, [0.3])])
-    close(q_dot, [0.3, 0.3 / r], 1e-11)
+    close(q_dot, [0.3, 0.3 / r], 1e-11)  # x_dot - r phi_dot = 0
     N_F = iv.null_space_projector(J_F)
     close(q_dot, N_F @ iv.pseudoinverse(J_body @ N_F) @ [0.3], 1e-11)
 
@@ -198,14 +177,9 @@ def test_c_slip_the_newton_update_goes_by_the_goal_minus_what_is_reached():
     # It prints q + J^+ (r_goal r_i): the minus is lost.
     arm, q = PlanarArm([0.5, 0.4, 0.3]), np.array([0.3, 0.8, -0.5])
     goal = arm.forward_kinematics([0.5, 0.7, -0.2])[:2]
-    errors = []
     for _ in range(6):
-        error = goal - arm.forward_kinematics(q)[:2]
-        errors.append(np.linalg.norm(error))
-        q = q + iv.pseudoinverse(arm.jacobian(q)) @ error
-    assert errors[0] > 0.1
-    assert errors[4] < 10.0 * errors[3] ** 2  # quadratically
-    assert errors[-1] < 1e-14
+        q = q + iv.pseudoinverse(arm.jacobian(q)) @ (goal - arm.forward_kinematics(q)[:2])
+    close(arm.forward_kinematics(q)[:2], goal)
 
 
 def test_c_slip_at_a_singularity_the_norm_of_the_difference_is_least():
@@ -224,7 +198,6 @@ def test_c_from_the_third_task_on_a_product_of_the_single_projectors_is_wrong():
     J, two = np.array([J for J, _ in tasks]), iv.prioritized(tasks[:2])
     product = iv.null_space_projector(J[0]) @ iv.null_space_projector(J[1])
     wrong = two + product @ iv.pseudoinverse(J[2] @ product) @ (3.0 - J[2] @ two)
-    close(J[:2, 0] @ two, [1.0, 2.0])
     assert abs(J[1, 0] @ wrong - 2.0) > 0.5
 
 
@@ -241,9 +214,8 @@ def lexicographic(tasks):
 
 
 def conflicting(rng, kind, n=6):
-    """Return three to five tasks: feasible, with more rows than joints, repeated, or contradictory."""
-    rows = {'feasible': [2, 1, 2], 'crowded': [2, 3, 3, 2]}.get(kind, [2, 2, 1, 2, 1])
-    tasks = [(rng.normal(size=(m, n)), rng.normal(size=m)) for m in rows]
+    """Return five tasks: feasible, repeated, contradictory, or the first one singular."""
+    tasks = [(rng.normal(size=(m, n)), rng.normal(size=m)) for m in (2, 2, 1, 2, 1)]
     if kind == 'repeated':
         tasks[2] = tasks[0][0][:1], tasks[0][1][:1]
         tasks[3] = tasks[1]
@@ -255,7 +227,7 @@ def conflicting(rng, kind, n=6):
     return tasks
 
 
-@pytest.mark.parametrize('kind', ['feasible', 'crowded', 'repeated', 'contradictory', 'singular'])
+@pytest.mark.parametrize('kind', ['feasible', 'repeated', 'contradictory', 'singular'])
 def test_each_task_is_done_as_well_as_those_before_it_allow_and_disturbs_none_of_them(kind):
     rng = np.random.default_rng(11)
     for _ in range(10):
@@ -267,9 +239,6 @@ def test_each_task_is_done_as_well_as_those_before_it_allow_and_disturbs_none_of
             alone = iv.prioritized(tasks[:k])
             for J, _ in tasks[:k]:
                 close(J @ q_dot, J @ alone, 1e-11 * size)
-        if kind != 'singular':
-            J, x_dot = tasks[0]
-            close(J @ q_dot, x_dot, 1e-11 * size)
 
 
 def test_tasks_that_conflict_but_for_rounding_move_no_joint_fast():
@@ -323,15 +292,12 @@ def test_d_slip_the_stiffness_of_the_spring_belongs_before_the_transpose():
     # Its step 4 prints 1/B J^T Delta for Q = J^T W, W = gamma Delta and q_dot = Q/B.
     arm, q, target = PlanarArm([0.5, 0.4, 0.3]), np.array([0.3, 0.8, -0.5]), np.array([0.7, 0.7, 0.1])
     gamma, B, dt = 2.0, 4.0, 1e-6
-    J = arm.jacobian(q, heading=True)
 
     def energy(q):
         delta = target - arm.forward_kinematics(q)
         return 0.5 * gamma * delta @ delta
 
-    delta = target - arm.forward_kinematics(q)
-    q_dot = gamma / B * J.T @ delta
-    close(q_dot, arm.joint_torques(q, gamma * delta) / B)
+    q_dot = arm.joint_torques(q, gamma * (target - arm.forward_kinematics(q))) / B
     # Friction consumes what the spring gives, without a rest.
     rate = (energy(q + q_dot * dt) - energy(q - q_dot * dt)) / (2.0 * dt)
     close(rate, -B * q_dot @ q_dot, 1e-8)
@@ -340,17 +306,11 @@ def test_d_slip_the_stiffness_of_the_spring_belongs_before_the_transpose():
 # --- E: derivation of the differential drive; wheel 1 is the left one, 2 the right
 
 
-def test_e_rolling_and_no_slip_of_both_wheels_are_the_forward_kinematics():
-    A_q, A_w = dd.rolling_constraints(psi, r, l)
+def test_e_theta_dot_by_constraints_by_the_rigid_axle_and_by_superposition_about_o():
     omega_1, omega_2 = LEFT_RIGHT
     v_x, theta_dot = r * omega_1 / 2.0 + r * omega_2 / 2.0, (r * omega_2 - r * omega_1) / l
-    close(A_w @ [omega_2, omega_1], [0.0, r * omega_2, r * omega_1])
+    A_q, A_w = dd.rolling_constraints(psi, r, l)
     close(np.linalg.solve(A_q, A_w @ [omega_2, omega_1]), [v_x * c, v_x * s, theta_dot])
-
-
-def test_e_theta_dot_by_the_rigid_axle_and_by_superposition_about_o():
-    omega_1, omega_2 = LEFT_RIGHT
-    theta_dot = (r * omega_2 - r * omega_1) / l
     for phi_dot in LEFT_RIGHT:  # v_C = 0 + phi_dot j x r k
         close(point_velocity([0, 0, 0], [0, phi_dot, 0], [0, 0, r]), [r * phi_dot, 0.0, 0.0])
     right = point_velocity([r * omega_1, 0, 0], [0, 0, theta_dot], [0, -l, 0])
@@ -376,4 +336,3 @@ def test_e_slip_checking_kinematics_with_unit_dimensions():
     # It prints [1, -1] for v = 0, theta_dot = 2. Its own inverse gives [-1, 1]: a turn to the left needs
     # the right wheel forward, and [1, -1] was shown to give -2 just before.
     assert np.array_equal(inverse @ [0.0, 2.0], [-1.0, 1.0])
-    assert dd.body_to_wheel(0.0, 2.0, 1.0, 1.0) == (1.0, -1.0)  # right, left
