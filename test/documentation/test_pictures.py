@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from matplotlib.patches import Polygon
 from matplotlib.text import Text
+from support import commands
 
 from diffdrive_jacobian import plots
 from diffdrive_jacobian.kinematics.spatial_arm import IIWA
 from diffdrive_jacobian.plots import arm_pictures, rendering, spatial_pictures
-from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools.plot_jacobian import main
 
 LARGEST = 100_000
 """Size of a picture (bytes)."""
@@ -32,11 +31,10 @@ def folder(tmp_path, monkeypatch):
 
 
 def run(*arguments):
-    """Run the tool in this process; return its exit code."""
-    try:
-        return main(arguments, Signals())
-    except SystemExit as end:
-        return end.code
+    return commands.run('plot_jacobian', *arguments)
+
+
+# --- The pictures
 
 
 @pytest.mark.slow
@@ -84,102 +82,35 @@ def test_the_ellipses_are_a_line_at_the_axle_and_a_circle_at_half_the_wheel_sepa
     np.testing.assert_allclose(ratios, [0.0, 0.5, 1.0, 2.0], atol=1e-3)
 
 
+def arrows(axes, begin):
+    """Return the vectors of the arrows that begin at a point."""
+    drawn = [one for one in axes.texts if one.arrow_patch is not None]
+    return [np.subtract(one.xy, one.xyann) for one in drawn if np.allclose(one.xyann, begin)]
+
+
 def test_the_axle_centre_is_half_way_between_the_wheel_centres_and_faces_forward():
     (axes,) = plots.figure_2(L=0.3).axes
-    points = [one.get_xydata()[0] for one in axes.lines if one.get_marker() == 'o']
-    C_1, C_2, C = points
+    C_1, C_2, C = (one.get_xydata()[0] for one in axes.lines if one.get_marker() == 'o')
     np.testing.assert_allclose((C_1 + C_2) / 2.0, C)
     assert np.linalg.norm(C_1 - C_2) == pytest.approx(0.3)
-    arrows = [one for one in axes.texts if one.arrow_patch is not None]
-    from_C = [np.subtract(one.xy, one.xyann) for one in arrows if np.allclose(one.xyann, C)]
-    assert len(from_C) == 4  # the heading, v_C, e_f, e_l
-    along = [vector @ (C_1 - C_2) / np.linalg.norm(vector) / 0.3 for vector in from_C]
+    along = [vector @ (C_1 - C_2) / np.linalg.norm(vector) / 0.3 for vector in arrows(axes, C)]
+    # The heading, v_C, e_f, e_l.
     np.testing.assert_allclose(along, [0.0, 0.0, 0.0, -1.0], atol=1e-12)
 
 
-def test_the_columns_of_the_wheel_cancel_at_the_ground_and_the_feet_stand_on_it():
+def test_the_columns_of_the_wheel_cancel_at_the_ground():
     (axes,) = plots.wheel(r=0.5).axes
-    arrows = [one for one in axes.texts if one.arrow_patch is not None]
-    at_ground = [np.subtract(one.xy, one.xyann) for one in arrows if np.allclose(one.xyann, [1.0, 0.0])]
+    at_ground = arrows(axes, [1.0, 0.0])
     assert len(at_ground) == 2
     np.testing.assert_allclose(np.sum(at_ground, axis=0), 0.0, atol=1e-12)
+
+
+def test_the_feet_of_the_legs_stand_on_the_ground():
     (axes,) = plots.legs().axes
     drawn = [one.get_xydata() for one in axes.lines if len(one.get_xydata()) == 3]
     np.testing.assert_allclose([leg[-1] for leg in drawn], arm_pictures.FEET)
     lengths = np.linalg.norm(np.diff(drawn, axis=1), axis=-1)
     np.testing.assert_allclose(lengths, np.broadcast_to(arm_pictures.LEG.lengths, (2, 2)))
-
-
-def test_every_picture_is_public_and_in_the_documentation(folder, capsys):
-    figures = {f'{what}_figure' for what in ('calibration', 'run', 'sweep')}
-    assert {*plots.PICTURES, 'PICTURES', *figures} == {*plots.__all__}
-    table = (ROOT / 'doc' / 'documents.md').read_text().split('| name | shows |', 1)[1].split('\n\n')[0]
-    assert dict(re.findall(r'^\| `(\w+)` \| (.*) \|$', table, re.MULTILINE)) == plots.PICTURES
-    assert run('--help') == 0
-    helped = capsys.readouterr().out
-    assert all(f'  {name}' in helped and what in helped for name, what in plots.PICTURES.items())
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'file', 'begin'),
-    [
-        ((), 'geometry.png', b'\x89PNG'),
-        (('-o', 'a.svg', '--force'), 'a.svg', b'<?xml'),
-        (('--output', 'a.pdf'), 'a.pdf', b'%PDF'),
-    ],
-)
-def test_the_command_writes_a_picture(folder, capsys, arguments, file, begin):
-    if '--force' in arguments:
-        (folder / file).write_bytes(b'replaced')
-    assert run('geometry', *arguments) == 0
-    assert capsys.readouterr() == (f'{file}\n', '')
-    assert [one.name for one in folder.iterdir()] == [file]
-    assert (folder / file).read_bytes().startswith(begin)
-
-
-DH = 'a: [0, 0.4, 0.3]\nalpha: [1.5708, 0, 0]\nd: [0.2, 0, 0]\n'
-
-
-@pytest.mark.parametrize(
-    ('options', 'axes', 'rings'),
-    [
-        (('--lengths', '1', '0.7', '0.3', '--q', '0.5', '-1', '1'), 'x [m]', 2),
-        (('--lengths', '1', '1', '--q', '0', '0'), 'x [m]', 2),
-        (('--dh', 'arm.yaml'), 'z [m]', 6),
-        (('--dh', 'slides.yaml', '--q', '0.5', '-1', '0.1'), 'z [m]', 6),
-    ],
-)
-def test_any_arm_is_drawn_at_one_configuration(folder, monkeypatch, options, axes, rings):
-    """An ellipse of velocities and one of forces, three of each in space."""
-    (folder / 'arm.yaml').write_text(DH)
-    (folder / 'slides.yaml').write_text(DH + 'theta: 0.1\nprismatic: [2]\n')
-    drawn = []
-    monkeypatch.setattr(rendering, 'render', lambda figure, ending: drawn.append(figure) or b'')
-    assert run('arm_at', *options) == 0
-    (plane,) = drawn[0].axes
-    assert axes in {plane.get_xlabel(), getattr(plane, 'get_zlabel', str)()}
-    # Of 100 points, or two lines where a force may be infinite.
-    assert len([line for line in plane.lines if len(line.get_xdata()) in (100, 5)]) == rings
-
-
-@pytest.mark.parametrize(
-    'text',
-    [
-        '',
-        '3',
-        'a: 1',
-        DH + 'b: 1',
-        DH.replace('0.3', 'x'),
-        'a: [',
-        DH + 'prismatic: [7]',
-        'd: &d 0\na: *d\nalpha: 0',
-    ],
-)
-def test_a_file_without_an_arm_is_refused(folder, capsys, text):
-    (folder / 'arm.yaml').write_text(text)
-    assert run('arm_at', '--dh', 'arm.yaml') == 2
-    assert 'arm.yaml must be a map with a, alpha and d, and perhaps theta' in capsys.readouterr().err
-    assert [one.name for one in folder.iterdir()] == ['arm.yaml']
 
 
 def test_the_elbow_moves_and_damping_bounds_the_joints():
@@ -192,39 +123,91 @@ def test_the_elbow_moves_and_damping_bounds_the_joints():
     assert exact[3].max() < 1e-3 < damped[3].max() < 5e-3
 
 
+def test_every_picture_is_public_in_the_documentation_and_in_the_help():
+    figures = {f'{what}_figure' for what in ('calibration', 'run', 'sweep')}
+    assert {*plots.PICTURES, 'PICTURES', *figures} == {*plots.__all__}
+    table = (ROOT / 'doc' / 'documents.md').read_text().split('| name | shows |', 1)[1].split('\n\n')[0]
+    assert dict(re.findall(r'^\| `(\w+)` \| (.*) \|$', table, re.MULTILINE)) == plots.PICTURES
+    helped = run('--help').out
+    assert all(f'  {name}' in helped and what in helped for name, what in plots.PICTURES.items())
+
+
+# --- The command
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'file', 'begin'),
+    [
+        ((), 'geometry.png', b'\x89PNG'),
+        (('-o', 'a.svg', '--force'), 'a.svg', b'<?xml'),
+        (('--output', 'a.pdf'), 'a.pdf', b'%PDF'),
+    ],
+)
+def test_the_command_writes_a_picture(folder, arguments, file, begin):
+    if '--force' in arguments:
+        (folder / file).write_bytes(b'replaced')
+    assert run('geometry', *arguments) == (0, f'{file}\n', '')
+    assert [one.name for one in folder.iterdir()] == [file]
+    assert (folder / file).read_bytes().startswith(begin)
+
+
+DH = 'a: [0, 0.4, 0.3]\nalpha: [1.5708, 0, 0]\nd: [0.2, 0, 0]\n'
+
+
+@pytest.mark.parametrize(
+    ('options', 'axes', 'rings'),
+    [
+        (('--lengths', '1', '0.7', '0.3', '--q', '0.5', '-1', '1'), 'x [m]', 2),
+        (('--lengths', '1', '1', '--q', '0', '0'), 'x [m]', 2),
+        (('--dh', 'slides.yaml', '--q', '0.5', '-1', '0.1'), 'z [m]', 6),
+    ],
+)
+def test_any_arm_is_drawn_at_one_configuration(folder, monkeypatch, options, axes, rings):
+    """An ellipse of velocities and one of forces, three of each in space."""
+    (folder / 'slides.yaml').write_text(DH + 'theta: 0.1\nprismatic: [2]\n')
+    drawn = []
+    monkeypatch.setattr(rendering, 'render', lambda figure, ending: drawn.append(figure) or b'')
+    assert run('arm_at', *options).code == 0
+    (plane,) = drawn[0].axes
+    assert axes in {plane.get_xlabel(), getattr(plane, 'get_zlabel', str)()}
+    # Of 100 points, or two lines where a force may be infinite.
+    assert len([line for line in plane.lines if len(line.get_xdata()) in (100, 5)]) == rings
+
+
+@pytest.mark.parametrize(
+    'text', ['3', DH + 'b: 1', DH.replace('0.3', 'x'), 'a: [', 'd: &d 0\na: *d\nalpha: 0']
+)
+def test_a_file_without_an_arm_is_refused(folder, text):
+    (folder / 'arm.yaml').write_text(text)
+    message = commands.refused('plot_jacobian', 'arm_at', '--dh', 'arm.yaml')
+    assert 'arm.yaml must be a map with a, alpha and d, and perhaps theta' in message
+    assert [one.name for one in folder.iterdir()] == ['arm.yaml']
+
+
 @pytest.mark.parametrize(
     ('arguments', 'code', 'message'),
     [
         (('geomtry',), 2, "argument NAME: must be one of geometry, .*got 'geomtry'"),
-        ((), 2, 'the following arguments are required: NAME'),
-        (('geometry', '-o', 'a.jpg'), 2, "the picture must end in .png, .svg, .pdf, got 'a.jpg'"),
+        (('geometry', '-o', 'a.jpg'), 2, 'the picture must end in .png, .svg, .pdf'),
         (('geometry', '--q', '1'), 2, '--q has no effect with geometry, but with arm_at'),
-        (('arm_at', '--q', '1'), 2, r'q must have shape \(..., 2\), got \(1,\)'),
-        (('arm_at', '--lengths', '1e300'), 2, 'the size of an arm to draw must be 1e-06 to 1e'),
+        (('damping', '--dh', 'a.yaml'), 2, '--dh has no effect with damping, but with arm_at'),
+        (('arm_at', '--q', '1'), 2, 'q must have shape'),
+        (('arm_at', '--lengths', '1e300'), 2, 'the size of an arm to draw must be'),
         (('arm_at', '--lengths', '1', '--dh', 'a.yaml'), 2, '--lengths and --dh exclude each other'),
         (('arm_at', '--dh', 'a.yaml'), 2, '--dh a.yaml cannot be read: No such file'),
-        (
-            ('arm_ellipses', '--lengths', '1', '1', '1'),
-            2,
-            'the arm must have 2 links for this, got 3',
-        ),
-        (('geometry', '--ros-args'), 2, 'plot_jacobian takes no ROS arguments'),
-        (('geometry', '-o', 'none/a.png'), 1, 'none/a.png cannot be written: No such file or directory'),
+        (('arm_ellipses', '--lengths', '1', '1', '1'), 2, 'the arm must have 2 links'),
+        (('geometry', '-o', 'none/a.png'), 1, 'none/a.png cannot be written: No such file'),
     ],
 )
-def test_mistakes_are_reported(folder, capsys, arguments, code, message):
-    assert run(*arguments) == code
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert re.match(f'plot_jacobian: error: .*{message}', last), last
+def test_mistakes_are_reported(folder, arguments, code, message):
+    assert re.match(message, commands.refused('plot_jacobian', *arguments, code=code))
     assert not list(folder.iterdir())
 
 
-def test_without_matplotlib_the_remedy_is_reported(folder, capsys, monkeypatch):
+def test_without_matplotlib_the_remedy_is_reported(folder, monkeypatch):
     for name in [name for name in sys.modules if name.partition('.')[0] == 'matplotlib']:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, 'matplotlib', None)
-    assert run('geometry') == 2
-    assert (
-        "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'" in capsys.readouterr().err
-    )
+    message = commands.refused('plot_jacobian', 'geometry')
+    assert message == "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'"
     assert not list(folder.iterdir())
