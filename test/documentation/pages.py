@@ -235,12 +235,7 @@ def is_run(block: Block) -> bool:
 
 def masked(line: str) -> str:
     """Return a line without what may differ from run to run: numbers and the width of spaces."""
-    return spaced(NUMBER.sub('#', line))
-
-
-def spaced(line: str) -> str:
-    """Return a line with single spaces."""
-    return ' '.join(line.split())
+    return ' '.join(NUMBER.sub('#', line).split())
 
 
 def check_output(quoted: Block, printed: str) -> None:
@@ -251,19 +246,19 @@ def check_output(quoted: Block, printed: str) -> None:
             integers at all, in others by more than one in the last place. Processors round differently.
     """
     exact = 'exact' in quoted.notes['output']
-    real = [spaced(line) for line in printed.strip().splitlines()]
-    lines = [spaced(line) for line in quoted.code.strip().splitlines()]
+    real, lines = printed.strip().splitlines(), quoted.code.strip().splitlines()
+    where = f'line {quoted.line}: printed was\n{printed}'
     if 'part' in quoted.notes['output']:
         rest = iter(real)
         for line in lines:
             assert any(agree(line, other, exact) for other in rest), (
-                f'line {quoted.line}: not printed, or not in this order: {line}\n{printed}'
+                f'not in this order: {line}; {where}'
             )
     else:
         found = shortened(real, lines)
-        assert len(found) == len(lines), f'line {quoted.line}: printed was\n{printed}'
+        assert len(found) == len(lines), where
         for line, other in zip(lines, found, strict=True):
-            assert agree(line, other, exact), f'line {quoted.line}: printed was\n{printed}'
+            assert agree(line, other, exact), where
 
 
 def agree(quoted: str, printed: str, exact: bool) -> bool:
@@ -334,15 +329,16 @@ def _written(value: object) -> str:
     return '.nan' if value != value else str(value)
 
 
+TABLE = re.compile(
+    r'(<!-- parameters of (\w+) -->\n).*?(<!-- end of parameters -->)', re.MULTILINE | re.DOTALL
+)
+
+
 def with_parameter_tables(text: str) -> str:
     """Return a page with its parameter tables as they should be."""
-    for name, parameters in PARAMETERS.items():
-        begin, end = f'<!-- parameters of {name} -->\n', '<!-- end of parameters -->'
-        before, _, rest = text.partition(begin)
-        if rest:
-            table = f'\n{parameter_table(parameters)}\n\n'
-            text = before + begin + table + end + rest.partition(end)[2]
-    return text
+    return TABLE.sub(
+        lambda match: f'{match[1]}\n{parameter_table(PARAMETERS[match[2]])}\n\n{match[3]}', text
+    )
 
 
 # --- Bodies of functions
@@ -425,17 +421,13 @@ def _constant_docstring(value: object, path: str) -> str:
         return str(description)
     name = path.split('.')[-1]
     for key, module in list(sys.modules.items()):
-        if key.startswith(f'{diffdrive_jacobian.__name__}.') and name in vars(module):
-            for statement, below in itertools.pairwise(ast.parse(inspect.getsource(module)).body):
-                target = statement.targets[0] if isinstance(statement, ast.Assign) else None
-                if (
-                    isinstance(target, ast.Name)
-                    and target.id == name
-                    and vars(module)[name] is value
-                    and isinstance(below, ast.Expr)
-                    and isinstance(below.value, ast.Constant)
-                ):
-                    return str(below.value.value)
+        if not key.startswith(f'{diffdrive_jacobian.__name__}.') or vars(module).get(name) is not value:
+            continue
+        for pair in itertools.pairwise(ast.parse(inspect.getsource(module)).body):
+            match pair:
+                case ast.Assign(targets=[ast.Name(id=found)]), ast.Expr(ast.Constant(text)):
+                    if found == name:
+                        return str(text)
     raise ValueError(f'the public constant {path} has no docstring')
 
 
@@ -461,34 +453,34 @@ def write_pictures() -> None:
             picture.save(ROOT / 'doc' / file, optimize=True)
 
 
-def main(what: str, names: list[str]) -> None:
-    """Write what is generated into the pages."""
-    for name in names or PAGES:
-        path = PAGES[name]
-        text = path.read_text()
-        new = text
-        if what == 'parameters':
-            new = with_parameter_tables(text)
-        elif what == 'bodies':
-            new = with_bodies(text)
-        else:
-            with tempfile.TemporaryDirectory() as directory:
-                for block, printed in reversed(run_page(text, Path(directory))):
-                    end = block.start + len(block.code)
-                    new = new[: block.start] + refreshed(block, printed) + new[end:]
-        if new != text:
-            path.write_text(new)
-            print(f'{name}: written')
+def with_outputs(text: str) -> str:
+    """Run a page, and return it with its outputs as they should be."""
+    with tempfile.TemporaryDirectory() as directory:
+        for block, printed in reversed(run_page(text, Path(directory))):
+            end = block.start + len(block.code)
+            text = text[: block.start] + refreshed(block, printed) + text[end:]
+    return text
+
+
+WRITTEN = {'parameters': with_parameter_tables, 'bodies': with_bodies, 'outputs': with_outputs}
+"""What is generated in pages, and the functions that write it."""
+
+
+def main(what: str = '', *names: str) -> None:
+    """Write what is generated."""
+    if what == 'public' and not names:
+        (ROOT / 'doc' / 'public.md').write_text(public_page())
+    elif what == 'pictures' and not names:
+        write_pictures()
+    elif what in WRITTEN and {*names} <= {*PAGES}:
+        for name in names or PAGES:
+            text = PAGES[name].read_text()
+            if (new := WRITTEN[what](text)) != text:
+                PAGES[name].write_text(new)
+                print(f'{name}: written')
+    else:
+        sys.exit(__doc__)
 
 
 if __name__ == '__main__':
-    if sys.argv[1:] == ['public']:
-        PAGES.get('doc/public.md', ROOT / 'doc' / 'public.md').write_text(public_page())
-        sys.exit()
-    if sys.argv[1:] == ['pictures']:
-        write_pictures()
-        sys.exit()
-    written = sys.argv[1:2] in (['parameters'], ['bodies'], ['outputs'])
-    if not written or not {*sys.argv[2:]} <= {*PAGES}:
-        sys.exit(__doc__)
-    main(sys.argv[1], sys.argv[2:])
+    main(*sys.argv[1:])

@@ -201,18 +201,6 @@ def test_c_from_the_third_task_on_a_product_of_the_single_projectors_is_wrong():
     assert abs(J[1, 0] @ wrong - 2.0) > 0.5
 
 
-def lexicographic(tasks):
-    """Minimise each error among the minima of those before it, by Lagrange's equations."""
-    q_dot = np.zeros(tasks[0][0].shape[1])
-    kept = np.zeros((0, len(q_dot)))
-    for J, x_dot in tasks:
-        square = np.block([[J.T @ J, kept.T], [kept, np.zeros((len(kept),) * 2)]])
-        right = np.concatenate([J.T @ x_dot, kept @ q_dot])
-        q_dot = np.linalg.lstsq(square, right, rcond=1e-11)[0][: len(q_dot)]
-        kept = np.concatenate([kept, J])
-    return np.linalg.lstsq(kept, kept @ q_dot, rcond=1e-11)[0]
-
-
 def conflicting(rng, kind, n=6):
     """Return five tasks: feasible, repeated, contradictory, or the first one singular."""
     tasks = [(rng.normal(size=(m, n)), rng.normal(size=m)) for m in (2, 2, 1, 2, 1)]
@@ -234,11 +222,15 @@ def test_each_task_is_done_as_well_as_those_before_it_allow_and_disturbs_none_of
         tasks = conflicting(rng, kind)
         q_dot = iv.prioritized(tasks)
         size = 1.0 + np.linalg.norm(q_dot)
-        close(q_dot, lexicographic(tasks), 1e-6 * size)
-        for k in range(1, len(tasks)):
+        N = np.eye(6)  # what leaves the tasks so far
+        for k, (J, x_dot) in enumerate(tasks, 1):
+            # No motion of it reduces the error of the next one.
+            close(N @ J.T @ (x_dot - J @ q_dot), 0.0, 1e-9 * size)
             alone = iv.prioritized(tasks[:k])
-            for J, _ in tasks[:k]:
-                close(J @ q_dot, J @ alone, 1e-11 * size)
+            done = np.concatenate([J for J, _ in tasks[:k]])
+            close(done @ q_dot, done @ alone, 1e-11 * size)
+            N = np.eye(6) - np.linalg.pinv(done, 1e-10) @ done
+            close(N @ alone, 0.0, 1e-9 * size)  # the least such velocity
 
 
 def test_tasks_that_conflict_but_for_rounding_move_no_joint_fast():
@@ -277,13 +269,11 @@ def test_d_the_transpose_and_the_least_squares_steps_reduce_the_error():
         left = delta - J @ step
         return left @ np.diag(m) @ left
 
-    JTMJ, JTM = J.T @ np.diag(m) @ J, J.T @ np.diag(m)
     assert error(0.1 * J.T @ delta) < error(np.zeros(3))
-    assert error(np.linalg.inv(JTMJ) @ JTM @ delta) < 1e-25
     # Its lambda is not squared: damped least squares of sqrt(M) J with sqrt(lambda).
-    root = np.sqrt(m)
-    for factor in (1e-6, 1e-2, 1.0):
-        step = np.linalg.inv(JTMJ + factor * np.eye(3)) @ JTM @ delta
+    root, JTM = np.sqrt(m), J.T @ np.diag(m)
+    for factor in (0.0, 1e-6, 1e-2, 1.0):
+        step = np.linalg.inv(JTM @ J + factor * np.eye(3)) @ JTM @ delta
         close(iv.damped_least_squares(root[:, np.newaxis] * J, root * delta, factor**0.5), step, 1e-9)
         assert error(step) < error(np.zeros(3))
 

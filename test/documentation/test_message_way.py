@@ -19,16 +19,18 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 PAGE = Path(__file__).parents[2] / 'doc' / 'design.md'
 PACKAGE = Path(diffdrive_jacobian.__file__).parent
 LINE = re.compile(r'( *)([\w/]+\.py) +([\w.]+)')
+QUALIFIED = sys.version_info >= (3, 11)
+"""Whether the name of a function that is called has that of its class."""
 
 
-def listed(what='way'):
+def listed(what):
     """Return level, file and function of each line of a list of the page."""
-    (block,) = re.findall(
-        rf'<!-- {what} -->\n```text\n(.*?)```', PAGE.read_text(encoding='utf-8'), re.DOTALL
-    )
+    text = PAGE.read_text(encoding='utf-8')
+    (block,) = re.findall(rf'<!-- {what} -->\n```text\n(.*?)```', text, re.DOTALL)
     lines = [LINE.match(line) for line in block.splitlines()]
     assert all(lines)
-    return [(len(one[1]) // 4, one[2], one[3]) for one in lines]
+    names = [one[3] if QUALIFIED else one[3].split('.')[-1] for one in lines]
+    return [(len(one[1]) // 4, one[2], name) for one, name in zip(lines, names, strict=True)]
 
 
 def calls_during(run):
@@ -56,10 +58,10 @@ def calls_during(run):
 
 @cache
 def function_of(code):
-    """Return file and name of a function; before Python 3.11 without its class."""
+    """Return file and name of a function."""
     path = Path(code.co_filename)
     file = str(path.relative_to(PACKAGE)) if PACKAGE in path.parents else ''
-    return file, getattr(code, 'co_qualname', code.co_name).replace('.<locals>', '')
+    return file, (code.co_qualname if QUALIFIED else code.co_name).replace('.<locals>', '')
 
 
 def test_an_odometry_takes_the_way_that_the_page_lists(lockstep):
@@ -69,8 +71,7 @@ def test_an_odometry_takes_the_way_that_the_page_lists(lockstep):
     goal.pose.position.x = goal.pose.position.y = 5.0
     lockstep.publish('goal_pose', goal)
     lockstep.run_for(2.0)
-    whole = hasattr(calls_during.__code__, 'co_qualname')
-    page = [(level, file, name if whole else name.split('.')[-1]) for level, file, name in listed()]
+    page = listed('way')
     functions = {(file, name) for _, file, name in page}
     taken = [
         (sum(one in functions for one in above[1:]), *above[0])
@@ -91,16 +92,13 @@ def test_a_message_between_any_two_nodes_passes_few_functions(lockstep):
     """Those that the page lists: they end when the other node has processed it, or lead to it."""
     lockstep.add(Talker())
     listener = lockstep.add(Node('listener'))
-    heard = []
-    listener.create_subscription(String, 'chatter', heard.append, 10)
+    listener.create_subscription(String, 'chatter', lambda message: None, 10)
     lockstep.run_for(0.95)
     calls = calls_during(lambda: lockstep.run_for(0.1))
     ours = [call[0] for call in calls if call[0][0]]
     (begin,) = [index for index, one in enumerate(ours) if one[1].endswith('send')]
     (end,) = [index for index, one in enumerate(ours) if one[1].endswith('receive')]
     page = [(file, name) for _, file, name in listed('way in lockstep')]
-    if not hasattr(calls_during.__code__, 'co_qualname'):
-        page = [(file, name.split('.')[-1]) for file, name in page]
     assert ours[begin : end + 1] == page
     assert len(page) <= 10
 
@@ -126,10 +124,7 @@ def test_a_message_to_a_process_takes_the_way_that_the_page_lists(lockstep, tmp_
     lockstep.publish('chatter', String(data='first'))
     calls = calls_during(lambda: lockstep.publish('chatter', String(data='second')))
     assert lockstep.last('answer').data == 'second'
-    whole = hasattr(calls_during.__code__, 'co_qualname')
-    left = [
-        (file, name if whole else name.split('.')[-1]) for _, file, name in listed('way to a process')
-    ]
+    left = [(file, name) for _, file, name in listed('way to a process')]
     for call in calls:
         if left and call[0] == left[0]:
             del left[0]
