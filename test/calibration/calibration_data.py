@@ -20,13 +20,13 @@ STEP = 0.02
 """Period of the encoders (s)."""
 
 
-def square(side=2.0, clockwise=False, speed=0.2, turn=1.0):
+def square(side=1.0, clockwise=False, speed=0.2, turn=1.0):
     """Return the commands of a square as (duration, v, omega)."""
     sign = -1.0 if clockwise else 1.0
     return [(side / speed, speed, 0.0), (np.pi / 2.0 / turn, 0.0, sign * turn)] * 4
 
 
-def umbmark(side=2.0, runs=5, **how):
+def umbmark(side=1.0, runs=1, **how):
     """Return the commands of UMBmark: a square in both directions, several times each."""
     commands = []
     for clockwise in (True, False):
@@ -43,17 +43,13 @@ class Drive:
     """Right, left (rad)."""
 
     @classmethod
-    def of(cls, commands, geometry=NOMINAL):
+    def of(cls, commands):
         """Return the drive of a controller that takes the robot for nominal."""
-        counts = [max(1, round(duration / STEP)) for duration, _, _ in commands]
-        speeds = [
-            np.array([v + omega * geometry.separation / 2, v - omega * geometry.separation / 2])
-            * duration
-            / count
-            / geometry.wheel_radius
-            for (duration, v, omega), count in zip(commands, counts, strict=True)
-        ]
-        steps = np.repeat(speeds, counts, axis=0)
+        steps = []
+        for duration, v, omega in commands:
+            count = max(1, round(duration / STEP))
+            rims = np.array([v, v]) + np.array([omega, -omega]) * NOMINAL.separation / 2.0
+            steps += [rims * duration / count / NOMINAL.wheel_radius] * count
         angles = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
         return cls(time=STEP * np.arange(len(angles)), angles=angles)
 
@@ -106,7 +102,7 @@ class Simulation:
         )
 
 
-SHORT = Drive.of(umbmark(side=1.0, runs=1, speed=0.5, turn=2.0))
+SHORT = Drive.of(umbmark(speed=0.5, turn=2.0))
 """25 seconds."""
 ROBOT = Simulation(drive=SHORT, rate=25)
 JOINTS = ['left_wheel_joint', 'right_wheel_joint']
@@ -128,8 +124,8 @@ def other_notes(result):
     return [note for note in result.notes if 'it may go unnoticed that both wheels' not in note]
 
 
-def with_stops(commands, pause=0.6):
-    return [one for command in commands for one in (command, (pause, 0.0, 0.0))]
+def with_stops(commands):
+    return [one for command in commands for one in (command, (0.6, 0.0, 0.0))]
 
 
 def stepped(readings, steps, random):
@@ -138,9 +134,7 @@ def stepped(readings, steps, random):
     return np.floor(readings / step + random.uniform(0.0, 1.0, 2)) * step
 
 
-def bag_messages(
-    recording, *, kind=PoseStamped, topic='/mocap/pose', position=True, begin=100.0, clock=0.0
-):
+def bag_messages(recording, *, kind=PoseStamped, topic='/mocap/pose', position=True, clock=0.0):
     """Return the messages of a recording as (seconds, topic, message), as `write_bag` takes them.
 
     Args:
@@ -148,17 +142,16 @@ def bag_messages(
         kind: Type of the reference.
         topic: Topic of the reference.
         position: Whether the joint states have positions beside their velocities.
-        begin: When it was recorded (s).
         clock: Added to the stamps of the reference (s).
     """
-    sent = []
+    begin, sent = 100.0, []
     speeds = np.gradient(recording.wheel_angles, recording.wheel_time, axis=0)
     for time, angles, speed in zip(
         recording.wheel_time.tolist(), recording.wheel_angles, speeds, strict=True
     ):
-        message = JointState(name=JOINTS, velocity=[*map(float, speed[::-1])])
+        message = JointState(name=JOINTS, velocity=speed[::-1].tolist())
         if position:
-            message.position = [*map(float, angles[::-1])]
+            message.position = angles[::-1].tolist()
         message.header.stamp = stamp(round((begin + time) * 1e9))
         sent.append((begin + time, '/joint_states', message))
     for time, pose in zip(recording.pose_time.tolist(), recording.poses, strict=True):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import resource
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -61,12 +60,6 @@ def bag(tmp_path_factory):
     return write(tmp_path_factory.mktemp('bags') / 'bag', bag_messages(RECORDING))
 
 
-@pytest.fixture(scope='module')
-def short(tmp_path_factory):
-    """A bag of a few seconds. It is not changed."""
-    return write(tmp_path_factory.mktemp('short') / 'bag')
-
-
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     """Where the tool works."""
@@ -108,7 +101,6 @@ def test_it_writes_parameters_and_a_picture(bag, folder, lockstep):
     code, out, err = run(bag, '-o', 'found.yaml', '--force')
     assert code == 0
     assert err.startswith('calibrate_run: where the robot turns in place, it may go unnoticed')
-    assert err.count('\n') == 1
     found = multipliers(folder / 'found.yaml')
     np.testing.assert_allclose(found, TRUE, atol=0.01)
     assert (folder / 'found.png').read_bytes().startswith(b'\x89PNG')
@@ -146,8 +138,7 @@ def test_known_quantities_are_options(bag):
 
 def test_the_picture_shows_both_paths_and_the_errors():
     driven = drive((3.0, 0.3, 0.5), (3.0, 0.3, -0.5), (3.0, 0.0, 1.0))
-    drawn = calibration_figure(calibrate([driven], NOMINAL))
-    plane, position, heading, residual = drawn.axes
+    plane, position, heading, residual = calibration_figure(calibrate([driven], NOMINAL)).axes
     labels = [text.get_text() for text in plane.get_legend().get_texts()]
     assert labels == ['odometry before', 'odometry after', 'reference', 'start']
     for panel in (position, heading):
@@ -165,7 +156,7 @@ def test_a_robot_of_this_package_is_calibrated_with_its_bag(lockstep, folder):
         lockstep.add(robot)
         lockstep.add(make_complete(WheelBridge, cmd_vel_timeout=0.0))
         made.look()
-        for duration, v, omega in umbmark(side=0.6, runs=1, speed=0.5, turn=2.0):
+        for duration, v, omega in umbmark(side=0.6, speed=0.5, turn=2.0):
             lockstep.publish('cmd_vel', twist(v, omega))
             lockstep.run_for(duration)
     read = read_wheels_and_reference(folder / 'bag')
@@ -187,21 +178,20 @@ def same(found, expected, **tolerance):
 
 
 @pytest.mark.parametrize('kind', [PoseWithCovarianceStamped, Odometry])
-def test_each_type_of_reference_gives_the_same(short, folder, kind):
-    other = read_wheels_and_reference(write(folder / 'other', kind=kind, topic='/ground_truth'))
-    assert (other.reference_topic, other.notes) == ('/ground_truth', ())
-    same(other.recording, read_wheels_and_reference(short).recording, rtol=0.0)
+def test_each_type_of_reference_gives_the_same_and_missing_messages_are_counted(folder, kind):
+    expected = read_wheels_and_reference(write(folder / 'bag'))
+    assert expected.reference_topic == '/mocap/pose'
+    other = write(folder / 'other', kind=kind, topic='/ground_truth')
+    count_more(other, '/joint_states', 7)
+    found = read_wheels_and_reference(other)
+    assert found.reference_topic == '/ground_truth'
+    assert found.notes == ('401 messages on /joint_states were found, the bag should have 408',)
+    same(found.recording, expected.recording, rtol=0.0)
 
 
-def test_messages_that_the_bag_counts_and_lacks_are_reported(short, folder):
-    path = shutil.copytree(short, folder / 'bag')
-    count_more(path, '/joint_states', 7)
-    notes = read_wheels_and_reference(path).notes
-    assert notes == ('401 messages on /joint_states were found, the bag should have 408',)
-
-
-def test_bad_messages_are_skipped_and_counted_and_odd_ones_give_the_same(short, folder):
+def test_bad_messages_are_skipped_and_counted_and_odd_ones_give_the_same(folder):
     """UTM coordinates, angles within a turn, joints of others, messages twice and in another order."""
+    expected = read_wheels_and_reference(write(folder / 'bag')).recording
     sent = []
     bad = of_topic(bag_messages(SHORT), '/mocap/pose')[20:23]
     for index, (time, topic, message) in enumerate(bag_messages(SHORT)):
@@ -220,14 +210,12 @@ def test_bad_messages_are_skipped_and_counted_and_odd_ones_give_the_same(short, 
     read = read_wheels_and_reference(write(folder / 'odd', sorted(sent, key=lambda one: one[0])))
     note = '3 of 27 messages on /mocap/pose hold invalid or implausible values and were skipped'
     assert note in ' '.join(read.notes)
-    expected = read_wheels_and_reference(short).recording
     kept = np.delete(np.arange(len(expected.pose_time)), slice(20, 23))
     turns = np.round((expected.wheel_angles - read.recording.wheel_angles)[0] / math.tau) * math.tau
-    moved = expected.poses[kept] + [5e5, 5.4e6, 0.0]
     expected = replace(
         expected,
         pose_time=expected.pose_time[kept],
-        poses=moved,
+        poses=expected.poses[kept] + [5e5, 5.4e6, 0.0],
         wheel_angles=expected.wheel_angles - turns,
     )
     same(read.recording, expected, rtol=0.0, atol=3e-9)
@@ -269,14 +257,13 @@ def test_straight_and_short_drives_are_refused_in_words(folder):
         (['--wheels', JOINTS[0], JOINTS[0]], ['both wheels', JOINTS[0]]),
         (['--wheel-radius', '50'], ['wheel radius must be in [0.001, 10] m, got 50.0']),
         (['-o', 'found.txt'], ['must end in .yaml']),
-        (['--wheel-radius', '-1'], ['must be positive']),
         (['--heading-noise', 'nan'], ['must be finite, got nan']),
         (['--yaw-offset', '90'], ['must be in radians']),
-        (['--lever-arm', '1'], ['expected 2 arguments']),
+        (['bag'], ['each bag can be given once']),
     ],
 )
-def test_wrong_arguments(short, folder, arguments, words):
-    shutil.copytree(short, folder / 'bag')
+def test_wrong_arguments(folder, arguments, words):
+    write(folder / 'bag')
     message = refused('bag', *arguments)
     assert all(word in message for word in words), message
     assert left(folder) == ['bag']
@@ -304,9 +291,6 @@ def change(sent, what):
     elif what == 'counter reset':
         for message in wheels[100:]:
             message.position = [one - 50.0 for one in message.position]
-    elif what == 'other joints':
-        for message in wheels:
-            message.name, message.position, message.velocity = ['arm'], [0.0], []
     elif what == 'names':
         for message in wheels:
             message.name = ['a', 'b']
@@ -321,19 +305,17 @@ def change(sent, what):
         ('clock reset', ['goes back in time by 49.', 'its clock was reset']),
         ('counter reset', ['jumps by 49.', 'its counter was reset']),
         ('names', ['--wheels LEFT RIGHT', "'a'", "'b'"]),
-        ('other joints', ['--wheels LEFT RIGHT', "'arm'"]),
     ],
 )
 def test_faults_of_a_bag_are_named(folder, what, words):
     sent = bag_messages(SHORT)
     change(sent, what)
-    write(folder / 'bag', sent)
-    message = refused('bag')
+    message = refused(write(folder / 'bag', sent))
     assert all(word in message for word in words), message
     assert left(folder) == ['bag']
 
 
-def test_topics_dimensions_and_bags_must_be_known_and_unique(folder):
+def test_topics_and_dimensions_must_be_known_and_unique(folder):
     sent = bag_messages(SHORT)
     wheels, poses = (
         [one for one in sent if one[1] == topic] for topic in ('/joint_states', '/mocap/pose')
@@ -351,13 +333,8 @@ def test_topics_dimensions_and_bags_must_be_known_and_unique(folder):
         ('unknown', {'parameters': None}, ['--wheel-radius and --wheel-separation']),
         ('differ', {'parameters': differ}, ['0.033 and 0.16 m, 0.05 and 0.3 m']),
     ):
-        write(folder / name, **how)
-        message = refused(name)
+        message = refused(write(folder / name, **how))
         assert all(word in message for word in words), (name, message)
-    assert 'each bag can be given once' in refused('two', 'two')
-
-
-# --- Files
 
 
 def test_nothing_stays_if_the_picture_cannot_be_written(bag, folder, monkeypatch):
