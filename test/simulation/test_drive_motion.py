@@ -10,7 +10,7 @@ import pytest
 
 from diffdrive_jacobian.control import VelocityLimits
 from diffdrive_jacobian.robot_testing.faults import ActuatorLag
-from diffdrive_jacobian.simulation import Robot, RobotModel, quadrature_moments
+from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 from diffdrive_jacobian.simulation.slip import Drift
 from diffdrive_jacobian.simulation.speeds import Course, Piece, Profile
@@ -33,7 +33,7 @@ def at_rest(**options):
     """Return a robot; acceleration limits, lag and delay are those of its actuators."""
     of_actuators = {'acceleration', 'lag', 'delay', 'max_right_speed'} & {*options}
     actuators = Actuators(**{name: options.pop(name) for name in of_actuators})
-    model = RobotModel(wheel_separation=L, actuators=actuators, **options)
+    model = RobotModel(**{'wheel_separation': L, **options}, actuators=actuators)
     return Robot(model=model, stamp=0, pose=(0.0, 0.0, 0.0))
 
 
@@ -119,6 +119,23 @@ def test_the_pose_is_that_of_an_integration(tau):
         close((x, y, math.remainder(theta, math.tau)), 0.0)
 
 
+# --- Limits, lag and delay
+
+
+def test_no_wheel_accelerates_beyond_its_limit_and_one_is_often_at_it():
+    rng = np.random.default_rng(5)
+    robot, stamp, shares = at_rest(acceleration=limits(max_wheel_acceleration=9.0)), 0, []
+    for _ in range(30):
+        robot = robot.commanded(rng.uniform((-0.5, -2.0), (0.5, 2.0)), stamp)
+        stamp += int(rng.integers(SECOND // 100, SECOND))
+        times = np.linspace(robot.stamp, stamp, 15).astype(int)
+        speeds = [robot.at(time).wheel_speeds for time in times.tolist()]
+        accelerations = np.diff(speeds, axis=0) / np.diff(times)[:, np.newaxis] * SECOND
+        shares += (np.abs(accelerations) / 9.0).max(axis=1).tolist()
+    assert max(shares) < 1.0 + 1e-6
+    assert np.count_nonzero(np.array(shares) > 0.999) > 45
+
+
 def test_a_speed_that_changes_by_its_rounding_takes_no_time():
     axis = AccelerationLimits(v=AxisLimits(max_acceleration=0.5, max_deceleration=-0.5))
     robot = at_rest(acceleration=axis, lag=0.1).commanded((0.3, 0.0), 0).at(SECOND)
@@ -126,30 +143,6 @@ def test_a_speed_that_changes_by_its_rounding_takes_no_time():
         # omega has no limit of its own, and changes while v does.
         turned = robot.commanded((0.3 + change, 1.0), SECOND).at(2 * SECOND)
         assert turned.pose[2] == pytest.approx(1.0 - 0.1 * (1.0 - math.exp(-10.0)), abs=2e-8)
-
-
-def test_no_acceleration_exceeds_its_limit_nor_does_that_of_a_wheel():
-    rng = np.random.default_rng(5)
-    robot, stamp, at_limit = at_rest(acceleration=limits(max_wheel_acceleration=12.0)), 0, 0
-    for _ in range(30):
-        robot = robot.commanded(rng.uniform((-0.5, -2.0), (0.5, 2.0)), stamp)
-        stamp += int(rng.integers(1, SECOND))
-        times = np.linspace(robot.stamp, stamp, 15).astype(int).tolist()
-        for one, other in pairwise(robot.at(time) for time in times):
-            dt = (other.stamp - one.stamp) / SECOND
-            if not dt:
-                continue
-            shares = [
-                (after - before) / dt / axis_rate(of, (before + after) / 2.0, after - before)
-                for of, before, after in zip((V, OMEGA), one.twist, other.twist, strict=True)
-                if before * after >= 0.0
-            ]
-            wheels = np.subtract(other.wheel_speeds, one.wheel_speeds) / dt / 12.0
-            share = np.abs([*shares, *wheels]).max()
-            assert share < 1.0 + 1e-6
-            at_limit += share > 0.999
-    # As fast as the limits allow.
-    assert at_limit > 45
 
 
 def test_a_delay_shifts_the_motion_of_the_motors_and_nothing_else():
@@ -169,19 +162,34 @@ def test_a_delay_shifts_the_motion_of_the_motors_and_nothing_else():
     close(late.at(9 * SECOND).pose, plain[-1].at(9 * SECOND).pose)
 
 
+def test_a_timeout_stops_by_deceleration():
+    robot = at_rest(acceleration=limits(), command_timeout=SECOND).commanded((0.4, 0.0), 0)
+    assert robot.at(SECOND + SECOND // 4).twist == pytest.approx((0.4 - 0.8 * 0.25, 0.0))
+    end = robot.at(3 * SECOND)
+    assert (end.twist, end.target, end.expiry) == ((0.0, 0.0), (0.0, 0.0), None)
+
+
+def test_velocity_limits_apply_to_the_target_and_a_weak_motor_clips_what_is_demanded():
+    robot = at_rest(acceleration=limits(), limits=VelocityLimits(max_v=0.2)).commanded((0.4, 1.0), 0)
+    assert robot.target == robot.at(5 * SECOND).twist == (0.2, 0.5)
+    robot = at_rest(acceleration=limits(), max_right_speed=4.0).commanded((0.4, 0.0), 0)
+    for stamp in range(0, 2 * SECOND, SECOND // 10):
+        right, left = robot.at(stamp).wheel_speeds
+        assert left == pytest.approx(min(0.5 * stamp / SECOND, 0.4) / 0.033)
+        assert right == pytest.approx(min(4.0, left))
+
+
 @pytest.mark.parametrize('drift', [None, Drift(seed=4), Drift(wheel_separation_multiplier=1.1)], ids=str)
 def test_the_motion_does_not_depend_on_when_it_is_looked_at(drift):
+    options = {'lag': 0.2, 'delay': 30_000_000, 'drift': drift, 'command_timeout': SECOND // 2}
+
     def drive(looks):
-        robot = at_rest(
-            acceleration=limits(), lag=0.2, delay=30_000_000, drift=drift, command_timeout=SECOND // 2
-        )
-        time = 11
+        robot, time = at_rest(acceleration=limits(), **options), 11
         for v, omega, seconds in ((0.2, 0.0, 0.11), (0.1, -1.0, 0.234567), (-0.2, 0.5, 2.9)):
             robot = robot.commanded((v, omega), time)
-            end = time + round(seconds * SECOND)
             for look in looks:
-                robot.at(time + round(look * (end - time)))
-            time = end
+                robot.at(time + round(look * seconds * SECOND))
+            time += round(seconds * SECOND)
         return robot.at(time)
 
     one, other = drive([]), drive([0.1, 0.11, 0.5, 0.77, 0.7701])
@@ -190,6 +198,9 @@ def test_the_motion_does_not_depend_on_when_it_is_looked_at(drift):
     assert (one.wheel_angles, one.twist) == (other.wheel_angles, other.twist)
     assert one.covariance_tuple == other.covariance_tuple
     assert (drift is None) == (one.pose_tuple == one.true_pose_tuple)
+
+
+# --- Moments and slip
 
 
 def test_the_moments_are_those_of_many_short_arcs():
@@ -214,6 +225,17 @@ def test_the_moments_are_those_of_many_short_arcs():
     close((found - fine - (fine - coarse) / 3.0) / scale, 0.0, 5e-5)
 
 
+def test_the_moments_of_a_part_and_the_rest_are_those_of_the_whole():
+    robot = at_rest(acceleration=limits(), lag=0.1, wheel_travel_variance=1e-3)
+    robot = robot.commanded((0.4, 1.5), 0)
+    parts = robot
+    for stamp in range(7_000_000, 2 * SECOND, 77_000_000):
+        parts = parts.at(stamp)
+    whole = np.array(robot.at(2 * SECOND).moments)
+    close(np.array(parts.at(2 * SECOND).moments), whole, 1e-13)
+    assert whole[0] > 1e-5
+
+
 @pytest.mark.parametrize('lag', [0.1, 0.3])
 @pytest.mark.parametrize('acceleration', [0.3, 1.0])
 def test_at_the_very_beginning_no_variance_is_negative_and_no_speed_goes_back(acceleration, lag):
@@ -226,22 +248,21 @@ def test_at_the_very_beginning_no_variance_is_negative_and_no_speed_goes_back(ac
         assert min(here.twist) >= 0.0
 
 
-def test_the_moments_of_a_part_and_the_rest_are_those_of_the_whole():
-    robot = at_rest(acceleration=limits(), lag=0.1, wheel_travel_variance=1e-3)
-    robot = robot.commanded((0.4, 1.5), 0)
-    parts = robot
-    for stamp in range(7_000_000, 2 * SECOND, 77_000_000):
-        parts = parts.at(stamp)
-    whole = np.array(robot.at(2 * SECOND).moments)
-    close(np.array(parts.at(2 * SECOND).moments), whole, 1e-13)
-    assert whole[0] > 1e-5
+def test_a_heading_that_is_lost_at_once_takes_few_steps():
+    """The noise of wheels that are a tenth of a millimetre apart would need 8 million in a second."""
+    robot = at_rest(wheel_separation=1e-4, wheel_travel_variance=1.0, lag=0.1)
+    robot = robot.commanded((0.2, 0.0), 0).at(SECOND)
+    x = robot.pose_tuple[0]
+    assert np.isfinite(robot.covariance).all()
+    # The true heading is anything: the true position is about the start, k x / 4 for each axis.
+    assert robot.covariance[0, 0] == pytest.approx(x * x + x / 4.0, rel=1e-3)
 
 
 def test_true_wheels_without_slip_drive_the_same_motion_with_their_geometry():
     drift = Drift(right_wheel_radius_multiplier=1.02, wheel_separation_multiplier=0.95)
     robot = at_rest(acceleration=limits(), lag=0.1, drift=drift).commanded((0.3, 1.0), 0).at(2 * SECOND)
-    angles = np.array(robot.wheel_angles) * 0.033 * (1.02, 1.0)
-    close(robot.true_pose[2], (angles[0] - angles[1]) / (0.95 * L))
+    right, left = np.array(robot.wheel_angles) * 0.033 * (1.02, 1.0)
+    close(robot.true_pose[2], (right - left) / (0.95 * L))
 
 
 def test_slip_with_varying_speeds_has_the_variance_of_the_distance():
@@ -250,29 +271,15 @@ def test_slip_with_varying_speeds_has_the_variance_of_the_distance():
         robot = at_rest(acceleration=limits(), drift=Drift(seed=seed), wheel_travel_variance=k)
         end = robot.commanded((0.4, 0.0), 0).at(3 * SECOND // 2)
         distances.append(end.true_pose[0] - end.pose[0])
-        rolled = end.wheel_angles[0] * 0.033
+    rolled = end.wheel_angles[0] * 0.033
     # Two wheels with k rolled each, their mean; less what the heading takes.
     assert np.var(distances) == pytest.approx(k * rolled / 2.0, rel=0.5)
 
 
-def test_a_timeout_stops_by_deceleration():
-    robot = at_rest(acceleration=limits(), command_timeout=SECOND).commanded((0.4, 0.0), 0)
-    assert robot.at(SECOND + SECOND // 4).twist == pytest.approx((0.4 - 0.8 * 0.25, 0.0))
-    end = robot.at(3 * SECOND)
-    assert (end.twist, end.target, end.expiry) == ((0.0, 0.0), (0.0, 0.0), None)
+# --- Bad input, extreme times
 
 
-def test_velocity_limits_apply_to_the_target_and_a_weak_motor_clips_what_is_demanded():
-    robot = at_rest(acceleration=limits(), limits=VelocityLimits(max_v=0.2)).commanded((0.4, 1.0), 0)
-    assert robot.target == robot.at(5 * SECOND).twist == (0.2, 0.5)
-    robot = at_rest(acceleration=limits(), max_right_speed=4.0).commanded((0.4, 0.0), 0)
-    for stamp in range(0, 2 * SECOND, SECOND // 10):
-        right, left = robot.at(stamp).wheel_speeds
-        assert left == pytest.approx(min(0.5 * stamp / SECOND, 0.4) / 0.033)
-        assert right == pytest.approx(min(4.0, left))
-
-
-def test_limits_with_the_wrong_sign_are_refused():
+def test_invalid_limits_and_lags_are_refused():
     for name, value in (
         *(('max_acceleration', bad) for bad in (-0.1, 0.0)),
         *(('max_deceleration', bad) for bad in (0.1, math.nan)),
@@ -280,16 +287,16 @@ def test_limits_with_the_wrong_sign_are_refused():
     ):
         with pytest.raises(ValueError, match=name):
             AxisLimits(**{name: value})
-
-
-def test_a_lag_below_the_resolution_of_times_is_refused():
-    """As small as it was, the steps of the motion did not progress."""
-    for lag in (5e-324, 1e-20, 9e-10):
-        with pytest.raises(ValueError, match=f'lag must be 0 or at least 1e-09 s, got {lag}'):
-            Actuators(lag=lag)
-        with pytest.raises(ValueError, match=f'seconds must be at least 1e-09 s, got {lag}'):
-            ActuatorLag(lag)
+    # Below the resolution of times the steps of the motion would not progress.
+    with pytest.raises(ValueError, match='lag must be 0 or at least 1e-09 s, got 9e-10'):
+        Actuators(lag=9e-10)
+    with pytest.raises(ValueError, match='seconds must be at least 1e-09 s, got 9e-10'):
+        ActuatorLag(9e-10)
     close(at_rest(lag=1e-9).commanded((0.2, 0.7), 0).at(SECOND).twist, (0.2, 0.7))
+    # This command would never be reached.
+    slow = AccelerationLimits(v=AxisLimits(max_acceleration=5e-324))
+    with pytest.raises(ValueError, match='limits of the acceleration must be larger'):
+        at_rest(acceleration=slow, lag=1.0).commanded((1e10, 0.0), 0)
 
 
 def test_steps_progress_also_where_they_are_shorter_than_the_resolution_of_times():
@@ -300,23 +307,3 @@ def test_steps_progress_also_where_they_are_shorter_than_the_resolution_of_times
     ends = [end for _, end in islice(profile.steps(1e9 - 1.0, 1e9 + 1.0), 1000)]
     assert ends[-1] == 1e9 + 1.0
     assert all(first < second for first, second in pairwise(ends))
-
-
-def test_a_heading_that_is_lost_at_once_takes_no_more_steps(monkeypatch):
-    """The noise of wheels that are a tenth of a millimetre apart needs 8 million steps in a second."""
-    steps = []
-    after = quadrature_moments._after
-    monkeypatch.setattr(quadrature_moments, '_after', lambda *step: steps.append(step) or after(*step))
-    wheels = RobotModel(wheel_separation=1e-4, wheel_travel_variance=1.0, actuators=Actuators(lag=0.1))
-    robot = Robot(model=wheels, stamp=0, pose=(0.0, 0.0, 0.0)).commanded((0.2, 0.0), 0).at(SECOND)
-    x = robot.pose_tuple[0]
-    assert np.isfinite(robot.covariance).all()
-    # The true heading is anything: the true position is about the start, k x / 4 for each axis.
-    assert robot.covariance[0, 0] == pytest.approx(x * x + x / 4.0, rel=1e-3)
-    assert len(steps) <= 32 * 40
-
-
-def test_a_command_that_is_never_reached_is_refused():
-    slow = AccelerationLimits(v=AxisLimits(max_acceleration=5e-324))
-    with pytest.raises(ValueError, match='limits of the acceleration must be larger'):
-        at_rest(acceleration=slow, lag=1.0).commanded((1e10, 0.0), 0)

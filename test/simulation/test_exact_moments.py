@@ -11,10 +11,7 @@ from support.moments_reference import DRIVES, noisy_runs, reference
 
 from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.simulation import Robot, RobotModel
-from diffdrive_jacobian.simulation.exact_moments import (
-    gaussian,
-    propagate_moments,
-)
+from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
 from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance
 
 L, K = 0.16, 1e-5
@@ -27,7 +24,7 @@ ARCS = [
     *((0.2, omega, 4.0) for omega in (0.0, 1e-12, -1e-6, 0.0124, -0.0126, 2.0)),
     *((-0.2, omega, 4.0) for omega in (0.0, 1e-3)),
     *((0.0, omega, 4.0) for omega in (1e-12, -1.0)),
-    *((0.08, 1.0, duration) for duration in (1e-9, 0.02, 0.0499, 0.0501, 5.0)),
+    *((0.08, 1.0, duration) for duration in (1e-9, 0.0499, 0.0501, 5.0)),
     *((0.22, omega, 300.0) for omega in (0.0, 1e-4, 0.5)),
     *((0.22, 0.0, 1e-9), (0.0, 0.0, 1.0)),
 ]
@@ -53,20 +50,19 @@ def positive_semidefinite(moment, tolerance=1e-12):
     assert np.linalg.eigvalsh(moment / np.outer(deviations, deviations)).min() >= -tolerance
 
 
-@pytest.mark.parametrize(
-    'start',
-    [
-        SURE,
-        gaussian(COVARIANCE),
-        gaussian(np.diag([0.0, 0.0, 1.0])),
-        # That of an arc, which is not Gaussian.
-        propagate_moments(gaussian(COVARIANCE), np.zeros(3), (0.22, 0.3), 20.0, L, 1e-2),
-    ],
-    ids=['sure', 'unsure', 'heading', 'arc'],
-)
-def test_the_closed_form_solves_the_differential_equation(start):
+STARTS = {
+    'sure': SURE,
+    'unsure': gaussian(COVARIANCE),
+    'heading': gaussian(np.diag([0.0, 0.0, 1.0])),
+    # That of an arc, which is not Gaussian.
+    'arc': propagate_moments(gaussian(COVARIANCE), np.zeros(3), (0.22, 0.3), 20.0, L, 1e-2),
+}
+
+
+@pytest.mark.parametrize('name', STARTS)
+def test_the_closed_form_solves_the_differential_equation(name):
     """A matrix exponential in extended precision is the reference."""
-    noise = (K, 1e-2) if start == SURE else (0.0, K, 1e-2)
+    start, noise = STARTS[name], (K, 1e-2) if name == 'sure' else (0.0, K, 1e-2)
     for (v, omega, duration), k in itertools.product(ARCS, noise):
         actual = propagate_moments(start, START, (v, omega), duration, L, k)
         expected = reference(start, START[2], (v, omega), duration, L, k)

@@ -46,17 +46,15 @@ def test_a_perfect_robot_has_no_ground_truth_and_is_where_its_odometry_says(lock
     assert 'ground_truth' not in dict(robot.get_topic_names_and_types())
 
 
-@pytest.mark.parametrize('parameters', [SLIPPING, SLIPPING | MULTIPLIERS], ids=['slip', 'wheels too'])
 def test_ground_truth_is_that_of_the_library_and_odometry_that_of_a_perfect_robot(
-    lockstep, robot_at, parameters, capfd
+    lockstep, robot_at, capfd
 ):
     topics, truths = Topics(lockstep), lockstep.listen(Odometry, 'ground_truth')
-    robot = robot_at(1.0, 2.0, 0.5, **parameters)
+    robot = robot_at(1.0, 2.0, 0.5, **SLIPPING, **MULTIPLIERS)
     lockstep.publish('cmd_vel', twist(0.2, 0.5))
     lockstep.run_for(0.4)
     assert instants(truths) == instants(topics.odom)
-    drift = Drift(seed=7, **{name: ASSUMED[name] for name in ASSUMED if f'true_{name}' in parameters})
-    model = RobotModel(drift=drift, wheel_travel_variance=1e-4)
+    model = RobotModel(drift=Drift(seed=7, **ASSUMED), wheel_travel_variance=1e-4)
     start = Robot(model=model, stamp=instants(truths)[0], pose=[1.0, 2.0, 0.5])
     start = start.commanded((0.2, 0.5), start.stamp)
     for message, odometry in zip(truths[1:], topics.odom[1:], strict=True):
@@ -69,8 +67,7 @@ def test_ground_truth_is_that_of_the_library_and_odometry_that_of_a_perfect_robo
         assert odometry.twist.twist == twist(0.2, 0.5)
     assert robot.truth.tolist() == expected.true_pose.tolist()
     assert np.linalg.norm(robot.truth - expected.pose) > 1e-4
-    assert not np.any(message.pose.covariance)
-    assert not np.any(message.twist.covariance)
+    assert not np.any([message.pose.covariance, message.twist.covariance])
     assert (message.header.frame_id, message.child_frame_id) == ('map', 'base_link')
     assert 'publishing /odom, /ground_truth' in capfd.readouterr().err
     assert change(robot, ground_truth_frame_id='earth').successful
@@ -79,20 +76,18 @@ def test_ground_truth_is_that_of_the_library_and_odometry_that_of_a_perfect_robo
 
 
 def test_a_robot_that_assumes_its_true_dimensions_is_where_its_odometry_says(lockstep, robot_at):
-    topics, truths = Topics(lockstep), lockstep.listen(Odometry, 'ground_truth')
+    topics = Topics(lockstep)
     robot = robot_at(1.0, 2.0, 0.5, **MULTIPLIERS, **ASSUMED)
     lockstep.publish('cmd_vel', twist(0.2, 0.5))
     lockstep.run_for(0.4)
-    assert len(truths) == len(topics.odom)
     assert robot.truth == pytest.approx(pose_of(topics.odom[-1]), abs=1e-14)
     # Its wheels turn for its true dimensions, not for the nominal ones.
     right, left = (0.2 + 0.5 * 0.16 * 1.05 / 2.0) / 1.02, (0.2 - 0.5 * 0.16 * 1.05 / 2.0) / 0.99
     assert list(topics.states[-1].velocity) == pytest.approx([left / 0.033, right / 0.033])
     # They can change during a drive: then the truth differs from the odometry from there on.
     assert change(robot, **dict.fromkeys(ASSUMED, 1.0)).successful
-    before = robot.truth - pose_of(topics.odom[-1])
     lockstep.run_for(0.2)
-    assert abs(robot.truth - pose_of(topics.odom[-1]) - before).max() > 1e-3
+    assert abs(robot.truth - pose_of(topics.odom[-1])).max() > 1e-3
 
 
 def test_initialpose_places_the_robot_and_reset_odometry_its_odometry_alone(lockstep, robot_at):
@@ -115,18 +110,13 @@ def test_initialpose_places_the_robot_and_reset_odometry_its_odometry_alone(lock
 
 
 def test_invalid_parameters_are_named():
+    frames = "parameters 'ground_truth_frame_id' and '{}' must differ"
     for parameters, named in (
         ({'slip_seed': -1}, "'slip_seed' must be"),
         ({'simulate_slip': 1}, "'simulate_slip' must be a bool"),
         *(({name: 0.099}, f"'{name}' must be in .0.1, 10., got 0.099") for name in MULTIPLIERS),
-        (
-            {'simulate_slip': True, 'ground_truth_frame_id': 'odom'},
-            "parameters 'ground_truth_frame_id' and 'odom_frame_id' must differ",
-        ),
-        (
-            {**MULTIPLIERS, 'base_frame_id': 'map'},
-            "parameters 'ground_truth_frame_id' and 'base_frame_id' must differ",
-        ),
+        ({'simulate_slip': True, 'ground_truth_frame_id': 'odom'}, frames.format('odom_frame_id')),
+        ({**MULTIPLIERS, 'base_frame_id': 'map'}, frames.format('base_frame_id')),
     ):
         with pytest.raises(ParameterError, match=named):
             VirtualRobotParameters().changed(parameters)
@@ -166,7 +156,6 @@ def run(tmp_path_factory):
 
 def test_a_run_has_the_ground_truth_and_is_verified_with_it_bit_for_bit(run):
     assert len(run.ground_truth) == len(run.odometry) > 90
-    assert run.ground_truth.columns == ('x', 'y', 'theta', 'v', 'omega')
     assert np.max(np.abs(run.ground_truth.values[:, :2] - run.odometry.values[:, :2])) > 1e-3
     verification = verify(run)
     assert verification.holds(1e-9, 1e-9)
@@ -182,7 +171,6 @@ def test_a_changed_ground_truth_and_another_seed_are_found(run):
     values[50, 0] += 1e-6
     verification = verify(replace(run, ground_truth=replace(run.ground_truth, values=values)))
     assert not verification.holds(1e-9, 1e-9)
-    assert verification.distances.max() == 0.0
     assert 'NOT as recorded' in report(verification, 1e-9, 1e-9)
     (name,) = run.parameters
     other = {name: run.parameters[name] | {'slip_seed': 8}}
