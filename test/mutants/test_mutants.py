@@ -34,8 +34,8 @@ def test_half_of_the_speed():
 
 
 @pytest.fixture
-def toy(tmp_path, monkeypatch):
-    """Put the program to work on another package."""
+def run(tmp_path, monkeypatch):
+    """What becomes of a mutant of another package if some tests execute its last line."""
     (tmp_path / 'toy' / 'laws').mkdir(parents=True)
     (tmp_path / 'toy' / 'laws' / 'law.py').write_text(LAW)
     (tmp_path / 'test').mkdir()
@@ -44,33 +44,29 @@ def toy(tmp_path, monkeypatch):
     monkeypatch.setattr(mutants, 'SOURCE', tmp_path / 'toy')
     monkeypatch.syspath_prepend(tmp_path / 'toy')
 
+    def run(mutant, *tests):
+        names = [f'test/test_speed.py::{name}' for name in tests]
+        lines = {'laws/law.py': {9: names}}
+        coverage = mutants.Coverage(cpu=dict.fromkeys(names, 0.1), lines=lines)
+        ((_, outcome),) = mutants.run_mutants([mutant], coverage, 1)
+        return outcome
 
-def run(mutant, *tests):
-    """Return what becomes of a mutant if these tests execute its last line."""
-    names = [f'test/test_speed.py::{name}' for name in tests]
-    lines = {'laws/law.py': {9: names}}
-    coverage = mutants.Coverage(cpu=dict.fromkeys(names, 0.1), lines=lines)
-    ((_, outcome),) = mutants.run_mutants([mutant], coverage, 1)
-    return outcome
+    return run
 
 
-def test_a_mutant_is_killed_by_the_test_that_notices_it_and_survives_without(toy):
+def test_a_mutant_is_killed_by_the_test_that_notices_it_and_survives_without(run):
     both = run(SPEED, 'test_speed', 'test_half_of_the_speed')
     assert both.result == 'killed'
     assert both.by == 'test/test_speed.py::test_half_of_the_speed'
     assert run(SPEED, 'test_speed').result == 'survived'
     assert run(SPEED).result == 'untested'
+    assert run(replace(SPEED, statement='return distance'), 'test_speed').result == 'gone'
 
 
-def test_a_mutant_that_does_not_end_is_stopped(toy, monkeypatch):
+def test_a_mutant_that_does_not_end_is_stopped(run, monkeypatch):
     monkeypatch.setattr(mutants, 'GRACE', 0.3)
     monkeypatch.setattr(mutants, 'SLOWER', 1.0)
-    endless = replace(SPEED, mutant='while True:')
-    assert run(endless, 'test_speed').result == 'timeout'
-
-
-def test_a_statement_that_is_no_longer_there_is_gone(toy):
-    assert run(replace(SPEED, statement='return distance'), 'test_speed').result == 'gone'
+    assert run(replace(SPEED, mutant='while True:'), 'test_speed').result == 'timeout'
 
 
 def test_a_statement_is_found_in_another_file_and_function_if_it_is_the_only_one():
@@ -79,20 +75,11 @@ def test_a_statement_is_found_in_another_file_and_function_if_it_is_the_only_one
     assert Statements({'laws/law.py': moved, 'laws/other.py': moved}).find(SPEED) is None
 
 
-def test_the_same_seed_gives_the_same_mutants():
+def test_numbers_conditions_and_statements_change_but_no_text_the_same_ones_for_a_seed():
     statements = Statements({'laws/law.py': ast.parse(LAW)})
-    first, again, other = (statements.sample('laws', 3, seed) for seed in (1, 1, 2))
-    assert len(first) == 3
-    assert first == again != other
-
-
-def test_numbers_conditions_and_statements_change_but_no_text():
-    changes = {
-        mutant.mutant
-        for seed in range(100)
-        for mutant in Statements({'laws/law.py': ast.parse(LAW)}).sample('laws', 9, seed)
-    }
-    assert changes == {
+    samples = [statements.sample('laws', 9, seed) for seed in range(100)]
+    assert samples == [statements.sample('laws', 9, seed) for seed in range(100)]
+    assert {mutant.mutant for sample in samples for mutant in sample} == {
         *('GAIN: float = 4.0', 'def speed(distance, *, limit=2.0):', 'pass', 'return None'),
         *('if distance >= limit:', 'if distance < limit:', 'if not distance > limit:'),
         *('return GAIN / distance',),
@@ -100,8 +87,8 @@ def test_numbers_conditions_and_statements_change_but_no_text():
 
 
 def test_a_changed_module_has_the_same_lines():
-    original, tree = ast.parse(LAW), ast.parse(LAW)
-    changed = mutated(tree, Statements({'laws/law.py': tree}).find(SPEED), SPEED)
+    original = ast.parse(LAW)
+    changed = mutated(original, Statements({'laws/law.py': original}).find(SPEED), SPEED)
     assert ast.unparse(changed) == ast.unparse(ast.parse(LAW.replace('GAIN *', 'GAIN /')))
     lines, changed_lines = (
         [(type(node), node.lineno) for node in ast.walk(each) if isinstance(node, ast.stmt)]
