@@ -269,6 +269,29 @@ def test_wrong_arguments(folder, arguments, words):
     assert left(folder) == ['bag']
 
 
+SENT = bag_messages(SHORT)
+TWO = sorted([*SENT, *bag_messages(SHORT, topic='/slam')], key=lambda one: one[0])
+DIFFERENT = {**DIMENSIONS, '/other': {'wheel_radius': 0.05, 'wheel_separation': 0.3}}
+
+
+@pytest.mark.parametrize(
+    ('how', 'words'),
+    [
+        ({'sent': [one for one in SENT if one[1] != '/mocap/pose']}, ['no topic ground_truth']),
+        ({'sent': [one for one in SENT if one[1] == '/mocap/pose']}, ['no topic joint_states']),
+        ({'sent': TWO}, ['several such topics, /mocap/pose, /slam: choose one with --reference']),
+        # Odometry is no reference unless it is chosen.
+        ({'kind': Odometry, 'topic': '/odom'}, ['no topic ground_truth', '/odom (nav_msgs/msg/Od']),
+        ({'parameters': None}, ['--wheel-radius and --wheel-separation']),
+        ({'parameters': DIFFERENT}, ['0.033 and 0.16 m, 0.05 and 0.3 m']),
+    ],
+    ids=['no reference', 'no wheels', 'two', 'odometry', 'unknown', 'different'],
+)
+def test_topics_and_dimensions_must_be_known_and_unique(folder, how, words):
+    message = refused(write(folder / 'bag', **how))
+    assert all(word in message for word in words), message
+
+
 def of_topic(sent, name):
     return [message for _, topic, message in sent if topic == name]
 
@@ -313,28 +336,6 @@ def test_faults_of_a_bag_are_named(folder, what, words):
     message = refused(write(folder / 'bag', sent))
     assert all(word in message for word in words), message
     assert left(folder) == ['bag']
-
-
-def test_topics_and_dimensions_must_be_known_and_unique(folder):
-    sent = bag_messages(SHORT)
-    wheels, poses = (
-        [one for one in sent if one[1] == topic] for topic in ('/joint_states', '/mocap/pose')
-    )
-    twice = sorted([*sent, *bag_messages(SHORT, topic='/slam')], key=lambda one: one[0])
-    differ = {**DIMENSIONS, '/other': {'wheel_radius': 0.05, 'wheel_separation': 0.3}}
-    listed = ['no topic ground_truth', '/cmd_vel (geometry_msgs/msg/Twist)', '/joint_states']
-    several = 'several such topics, /mocap/pose, /slam: choose one with --reference'
-    for name, how, words in (
-        ('wheels', {'sent': [*wheels, (99.0, '/cmd_vel', twist(0.0, 0.0))]}, listed),
-        ('poses', {'sent': poses}, ['no topic joint_states', '/mocap/pose (geometry_msgs/msg/Pose']),
-        ('two', {'sent': twice}, [several]),
-        # Odometry is no reference unless it is chosen.
-        ('odometry', {'kind': Odometry, 'topic': '/odom'}, ['no topic ground_truth', '/odom']),
-        ('unknown', {'parameters': None}, ['--wheel-radius and --wheel-separation']),
-        ('differ', {'parameters': differ}, ['0.033 and 0.16 m, 0.05 and 0.3 m']),
-    ):
-        message = refused(write(folder / name, **how))
-        assert all(word in message for word in words), (name, message)
 
 
 def test_nothing_stays_if_the_picture_cannot_be_written(bag, folder, monkeypatch):

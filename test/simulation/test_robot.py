@@ -127,14 +127,13 @@ def test_a_robot_is_immutable_and_does_not_change_with_the_arrays_it_was_given()
     robots = robot, robot.commanded((0.2, 0.1), 0).at(SECOND), robot.placed(pose, covariance, 0)
     before = [state(one) for one in robots]
     pose[:], covariance[:] = 7.0, 7.0
+    assert [state(one) for one in robots] == before
     for one in robots:
-        for array in (one.pose, one.covariance):
-            with pytest.raises(ValueError, match='read-only'):
-                array[0] = 7.0
+        assert not one.pose.flags.writeable
+        assert not one.covariance.flags.writeable
         for name in ('model', 'stamp', 'pose', 'covariance', 'wheel_angles', 'twist', 'expiry'):
             with pytest.raises(AttributeError):
                 setattr(one, name, getattr(robot, name))
-    assert [state(one) for one in robots] == before
 
 
 def test_a_copy_is_the_same_robot():
