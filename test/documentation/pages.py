@@ -235,7 +235,12 @@ def is_run(block: Block) -> bool:
 
 def masked(line: str) -> str:
     """Return a line without what may differ from run to run: numbers and the width of spaces."""
-    return ' '.join(NUMBER.sub('#', line).split())
+    return spaced(NUMBER.sub('#', line))
+
+
+def spaced(line: str) -> str:
+    """Return a line with single spaces."""
+    return ' '.join(line.split())
 
 
 def check_output(quoted: Block, printed: str) -> None:
@@ -246,7 +251,9 @@ def check_output(quoted: Block, printed: str) -> None:
             integers at all, in others by more than one in the last place. Processors round differently.
     """
     exact = 'exact' in quoted.notes['output']
-    real, lines = printed.strip().splitlines(), quoted.code.strip().splitlines()
+    real, lines = (
+        [spaced(line) for line in text.strip().splitlines()] for text in (printed, quoted.code)
+    )
     where = f'line {quoted.line}: printed was\n{printed}'
     if 'part' in quoted.notes['output']:
         rest = iter(real)

@@ -24,7 +24,7 @@ ARCS = [
     *((0.2, omega, 4.0) for omega in (0.0, 1e-12, -1e-6, 0.0124, -0.0126, 2.0)),
     *((-0.2, omega, 4.0) for omega in (0.0, 1e-3)),
     *((0.0, omega, 4.0) for omega in (1e-12, -1.0)),
-    *((0.08, 1.0, duration) for duration in (1e-9, 0.0499, 0.0501, 5.0)),
+    *((0.08, 1.0, duration) for duration in (1e-9, 0.02, 0.0499, 0.0501, 5.0)),
     *((0.22, omega, 300.0) for omega in (0.0, 1e-4, 0.5)),
     *((0.22, 0.0, 1e-9), (0.0, 0.0, 1.0)),
 ]
