@@ -221,15 +221,18 @@ def test_bad_messages_are_skipped_and_counted_and_odd_ones_give_the_same(folder)
     same(read.recording, expected, rtol=0.0, atol=3e-9)
 
 
-def test_wheels_that_are_given_are_not_looked_for():
-    parameters = {'wheel_bridge': {'left_wheel_name': 'a', 'right_wheel_name': 'b'}}
+def test_wheels_are_those_given_those_of_the_parameters_or_those_with_such_names():
     joints = ('a', 'b', 'left_wheel', 'right_wheel')
-    for there, given, expected in (
-        (joints, ('b', 'left_wheel'), ('b', 'left_wheel')),
-        (joints, None, ('a', 'b')),
-        (joints[2:], None, ('left_wheel', 'right_wheel')),
+    bridge = {'left_wheel_name': 'a', 'right_wheel_name': 'b'}
+    controller = {'left_wheel_names': ['b'], 'right_wheel_names': ['a']}
+    for there, given, parameters, expected in (
+        (joints, ('b', 'left_wheel'), bridge, ('b', 'left_wheel')),
+        (joints, None, bridge, ('a', 'b')),
+        (joints, None, controller, ('b', 'a')),
+        (joints[2:], None, bridge, ('left_wheel', 'right_wheel')),
     ):
-        assert wheel_names('run', '/joint_states', there, given, parameters) == expected
+        found = wheel_names('run', '/joint_states', there, given, {'node': parameters})
+        assert found == expected
 
 
 # --- Mistakes
