@@ -172,11 +172,17 @@ def test_a_new_command_restarts_the_timeout_and_standing_still_needs_none():
 
 def test_a_timeout_shortened_below_the_age_of_the_command_strikes_at_once():
     robot, now = start().commanded((0.2, 1.0), 0), 200_000_000
-    for timeout, expiry in ((SECOND, SECOND), (220_000_000, 220_000_000), (100_000_000, now), (0, None)):
+    for timeout, expiry in (
+        (SECOND, SECOND),
+        (220_000_000, 220_000_000),
+        (100_000_000, now),
+        (0, None),
+    ):
         changed = robot.remodelled(replace(MODEL, command_timeout=timeout), now)
         assert changed.expiry == expiry
-        moves = expiry != now
-        assert (changed.at(now + SECOND).pose.tobytes() != robot.at(now).pose.tobytes()) == moves
+    stopped = robot.remodelled(replace(MODEL, command_timeout=100_000_000), now).at(now + SECOND)
+    assert stopped.twist == (0.0, 0.0)
+    assert stopped.pose.tobytes() == robot.at(now).pose.tobytes()
 
 
 # --- Other models, other places
