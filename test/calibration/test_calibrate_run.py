@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import resource
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -67,12 +68,8 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def run(*arguments):
-    return commands.run('calibrate_run', *arguments)
-
-
-def refused(*arguments):
-    return commands.refused('calibrate_run', *arguments)
+run = partial(commands.run, 'calibrate_run')
+refused = partial(commands.refused, 'calibrate_run')
 
 
 def failed(*arguments):

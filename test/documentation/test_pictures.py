@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import sys
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -30,8 +31,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def run(*arguments):
-    return commands.run('plot_jacobian', *arguments)
+run = partial(commands.run, 'plot_jacobian')
 
 
 # --- The pictures
