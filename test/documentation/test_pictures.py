@@ -196,6 +196,7 @@ def test_a_file_without_an_arm_is_refused(folder, text):
         (('arm_at', '--lengths', '1', '--dh', 'a.yaml'), 2, '--lengths and --dh exclude each other'),
         (('arm_at', '--dh', 'a.yaml'), 2, '--dh a.yaml cannot be read: No such file'),
         (('arm_ellipses', '--lengths', '1', '1', '1'), 2, 'the arm must have 2 links'),
+        (('geometry', '--ros-args'), 2, '.*plot_jacobian takes no ROS arguments'),
         (('geometry', '-o', 'none/a.png'), 1, 'none/a.png cannot be written: No such file'),
     ],
 )
