@@ -1,30 +1,39 @@
-"""What go_to_goal warns of, and the rate of the odometry that it measures, without ROS."""
+"""What go_to_goal warns of, and the rate of the odometry that it measures."""
 
 from __future__ import annotations
 
 import math
 
 import pytest
+from support.lockstep_nodes import change, make
+from support.ros_messages import goal, path
 
+from diffdrive_jacobian.control import VelocityLimits
 from diffdrive_jacobian.nodes.advice import (
     gain_warnings,
     limit_warnings,
     path_warnings,
     rate_warnings,
 )
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.odometry_rate import PERIODS, OdometryRate
+from diffdrive_jacobian.nodes.stopping import overshoot_warnings, rolls_on
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
+from diffdrive_jacobian.simulation import closed_loops
+from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 
 MILLISECOND = 1_000_000
+SPIRAL, COAST, BACK = 'is not larger than kv', 'choose kp > 2 kv', 'may not back up'
+NO_FORWARD, NO_TURN = 'the robot may not drive forward', 'the robot may turn in one direction only'
 
 
 @pytest.mark.parametrize(
     ('limits', 'words'),
     [
         ({}, None),
-        ({'linear_x_max_velocity': 0.0}, 'linear.x.max_velocity is 0: the robot may not drive forward'),
-        ({'angular_z_max_velocity': 0.0}, 'the robot may turn in one direction only or not at all'),
-        ({'angular_z_min_velocity': -0.0}, 'the robot may turn in one direction only or not at all'),
+        ({'linear_x_max_velocity': 0.0}, f'linear.x.max_velocity is 0: {NO_FORWARD}'),
+        ({'angular_z_max_velocity': 0.0}, NO_TURN),
+        ({'angular_z_min_velocity': -0.0}, NO_TURN),
         ({'angular_z_max_velocity': 0.05}, 'limited to 0.05 rad/s: half a turn takes more than 60 s'),
         ({'angular_z_max_velocity': 0.06}, None),
     ],
@@ -45,20 +54,107 @@ def test_gains_that_are_too_large_for_the_rate():
     assert len(rate_warnings(GoToGoalParameters(**offset, use_goal_heading=True), 10.0)) == 1
 
 
-def test_gains_with_which_a_robot_that_takes_time_overshoots():
-    slow = {'linear_x_max_acceleration': 0.05, 'kv': 1.0, 'kp': 3.0}
-    (warning,) = gain_warnings(GoToGoalParameters(**slow))
-    assert warning.startswith('kv 1 lets the robot drive too fast to stop')
-    assert gain_warnings(GoToGoalParameters(**slow, stop_in_time=True)) == []
-    assert gain_warnings(GoToGoalParameters()) == []
-    (warning,) = gain_warnings(GoToGoalParameters(kp=0.3))
-    assert 'is not larger than kv' in warning
+@pytest.mark.parametrize(
+    ('unsuitable', 'suitable', 'words'),
+    [
+        ({'kp': 0.5, 'kv': 0.5}, {'kp': 0.6}, SPIRAL),
+        ({'controller': 'pose', 'kp': 1.0, 'kv': 0.5}, {'kp': 1.1}, COAST),
+        (
+            {'controller': 'offset_point', 'linear_x_min_velocity': 0.0},
+            {'linear_x_min_velocity': -0.1},
+            BACK,
+        ),
+        (
+            {'linear_x_max_acceleration': 0.05, 'kv': 1.0, 'kp': 3.0},
+            {'stop_in_time': True},
+            'kv 1 lets the robot drive too fast to stop',
+        ),
+    ],
+)
+def test_gains_and_limits_that_do_not_suit_the_law_of_goals(unsuitable, suitable, words):
+    (warning,) = gain_warnings(GoToGoalParameters(**unsuitable))
+    assert words in warning
+    assert gain_warnings(GoToGoalParameters(**{**unsuitable, **suitable})) == []
 
 
 def test_gains_of_the_law_of_paths():
     assert path_warnings(GoToGoalParameters()) == []
     (warning,) = path_warnings(GoToGoalParameters(path_controller='kanayama', k_theta=1.0))
     assert 'the robot weaves about the path' in warning
+
+
+def test_the_advice_is_given_where_a_robot_overshoots():
+    """The law `v = kv distance`, straight on, with a limit and from far away."""
+    limits = VelocityLimits(max_v=0.6, max_omega=1.0, min_omega=-1.0)
+    actuators = Actuators(
+        acceleration=AccelerationLimits(v=AxisLimits(max_acceleration=1.0, max_deceleration=-0.2))
+    )
+    gains = [0.5, 0.6, 0.8, 1.5]
+    found = closed_loops(
+        lambda poses, goals, gain: (gain * (goals[..., 0] - poses[..., 0]), 0.0 * poses[..., 0]),
+        [0.0, 0.0, 0.0], [3.0, 0.0], gains,
+        limits=limits, actuators=actuators, duration=12.0, rate=20.0,
+    )  # fmt: skip
+    advice = [bool(overshoot_warnings(kv, None, limits, actuators)) for kv in gains]
+    # Up to the tolerance the robot may be fast without overshooting by more than that.
+    assert advice == (found.overshoot > 0.02).tolist() == [False, False, True, True]
+    fast = VelocityLimits(max_v=5.0)
+    assert overshoot_warnings(0.5, None, fast, actuators)
+    assert not overshoot_warnings(None, None, fast, actuators)
+    assert not overshoot_warnings(0.5, None, fast, Actuators())
+
+
+def test_how_far_a_robot_rolls_on_is_described_where_it_is_known():
+    actuators = Actuators(
+        acceleration=AccelerationLimits(v=AxisLimits(max_acceleration=0.4, max_deceleration=-0.1)),
+        lag=0.1,
+        delay=200 * MILLISECOND,
+    )
+    words = '; the robot rolls on for about 0.260 m and turns by 0.000 rad'
+    assert rolls_on(actuators, (0.2, 0.0)) == words
+    assert rolls_on(actuators, (0.0, 0.0)) == rolls_on(actuators, (math.nan, 0.0)) == ''
+    assert rolls_on(Actuators(), (0.2, 0.0)) == ''
+
+
+# --- When the node logs it
+
+
+def test_the_node_warns_with_the_first_goal_and_when_that_changes(lockstep, capfd):
+    def warned():
+        said = capfd.readouterr().err
+        return {words for words in (SPIRAL, NO_FORWARD, NO_TURN) if words in said}
+
+    node = lockstep.add(make(GoToGoal, kp=0.5, kv=0.5, linear__x__max_velocity=0.0))
+    assert warned() == {NO_FORWARD}
+    for expected in ({SPIRAL}, set()):
+        lockstep.publish('goal_pose', goal(1.0, 0.0))
+        assert warned() == expected
+    for changes, expected in (
+        ({'linear__x__max_velocity': 1.0, 'controller': 'offset_point'}, set()),
+        ({'controller': 'go_to_goal'}, {SPIRAL}),
+        ({'kp': 0.6}, set()),
+        ({'kp': 0.5}, {SPIRAL}),
+        ({'angular__z__min_velocity': 0.0}, {SPIRAL, NO_TURN}),
+    ):
+        assert change(node, **changes).successful
+        assert warned() == expected
+
+
+def test_only_the_law_that_drives_is_warned_about(lockstep, capfd):
+    """That of goals does not drive along a path, nor that of paths to a goal."""
+    weaving = {'path_controller': 'kanayama', 'k_theta': 1.0}
+    lockstep.add(make(GoToGoal, kp=0.5, kv=0.5, **weaving))
+    for topic, message, heard, unheard in (
+        ('path', path((0.0, 0.0), (1.0, 0.0)), 'the robot weaves about the path', SPIRAL),
+        ('goal_pose', goal(1.0, 0.0), SPIRAL, 'weaves'),
+    ):
+        lockstep.publish(topic, message)
+        said = capfd.readouterr().err
+        assert heard in said
+        assert unheard not in said
+
+
+# --- The rate of the odometry
 
 
 def test_the_rate_is_measured_once_at_the_beginning_of_a_goal():

@@ -10,17 +10,13 @@ import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Goals, Odometry
-from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
-from support.ros_messages import goal, goals, odometry, receive, value_of
+from support.ros_messages import odometry, receive
 
 from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.drives import in_lockstep, overrides
-from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, ODOMETRY, PARAMETER_EVENT
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, driven_offset
@@ -35,12 +31,9 @@ from diffdrive_jacobian.nodes.remote_goal import (
 )
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import ParameterError
-from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.runner import Runner
-from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.ros.service_client import LONGEST_STEP, PENDING, Liveness
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.text import listed
 from diffdrive_jacobian.tools import send_goal as sending
 
 
@@ -76,7 +69,7 @@ def test_goals_are_sent_with_the_first_odometry_unless_withdrawn(ros, capfd):
     assert [pose.pose.position.y for pose in received[0].goals] == [0.0, 1.0]
 
 
-def test_a_single_goal_has_the_frame_and_a_status(ros):
+def test_a_single_goal_has_the_frame_and_a_status_and_is_canceled(ros):
     client = add_client(ros, [[1.0, 2.0, 0.0]], topic='goal_pose', frame='odom')
     received = ros.listen(PoseStamped, 'goal_pose')
     ros.add(GoToGoal)
@@ -87,8 +80,7 @@ def test_a_single_goal_has_the_frame_and_a_status(ros):
     assert not client.ended
     assert client.cancel_answer == ''
     client.cancel()
-    ros.until(lambda: client.ended, 'the goal is canceled')
-    ros.until(lambda: client.cancel_answer, 'the controller answers')
+    ros.until(lambda: client.ended and client.cancel_answer, 'the goal is canceled')
     assert client.cancel_answer == 'goal canceled, zero sent'
 
 
@@ -112,10 +104,11 @@ def test_distance_is_that_of_the_point_the_controller_drives(ros):
     unknown = Liveness(ros.peer, ['/go_to_goal'], ('controller', 'no_such_parameter'))
     ros.until(lambda: watch.silence() is None or watch.values, 'the parameters are reported')
     assert watch.values == {'/go_to_goal': {'controller': 'offset_point', 'offset': 0.25}}
-    client.arrival = Arrival(offset=driven_offset(watch.values['/go_to_goal']))
+    offset = driven_offset(watch.values['/go_to_goal'])
+    assert node.arrival.offset == offset
+    client.arrival = Arrival(offset=offset)
     receive(client, '/odom', odometry(0.0, 0.0, 0.0))
     assert client.distance == 0.75
-    assert node.arrival.offset == driven_offset(watch.values['/go_to_goal'])
     # A node without these parameters answers without values.
     ros.until(lambda: unknown.silence() is None or unknown.answering, 'an answer')
     assert unknown.values == {}
@@ -141,34 +134,22 @@ class Clock:
         return self.now
 
 
-@pytest.fixture
-def clock():
-    return Clock()
+def test_a_node_that_is_not_served_falls_silent_and_comes_back(ros):
+    clock, node = Clock(), ros.add(GoToGoal)
+    watch = Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
 
+    def await_answer():
+        watch.answering.clear()
 
-@pytest.fixture
-def watch(ros, clock):
-    """Watches a controller, by that clock."""
-    return Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
+        def answered():
+            clock.now += 0.1
+            watch.silence()
+            return watch.answering
 
+        ros.until(answered, 'an answer')
 
-def answered(ros, watch, clock):
-    """Wait for another answer: the silence ends."""
-    watch.answering.clear()
-
-    def over():
-        clock.now += 0.1
-        watch.silence()
-        return watch.answering
-
-    ros.until(over, 'an answer')
-
-
-def test_a_node_that_is_not_served_falls_silent_and_comes_back(ros, clock, watch):
-    node = ros.add(GoToGoal)
     for _ in range(3):
-        # Without odometry it answers, too.
-        answered(ros, watch, clock)
+        await_answer()
     ros.executor.remove_node(node)
     # Time in which this process stands still does not count.
     before = watch.silence()
@@ -186,10 +167,12 @@ def test_a_node_that_is_not_served_falls_silent_and_comes_back(ros, clock, watch
         watch.silence()
     assert len(watch._clients['/go_to_goal']._pending_requests) == PENDING
     ros.executor.add_node(node)
-    answered(ros, watch, clock)
+    await_answer()
 
 
-def test_a_node_without_parameter_services_is_never_silent(ros, clock, watch):
+def test_a_node_without_parameter_services_is_never_silent(ros):
+    clock = Clock()
+    watch = Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
     ros.add(GoToGoal, start_parameter_services=False)
     for _ in range(100):
         clock.now += 0.1
@@ -199,14 +182,9 @@ def test_a_node_without_parameter_services_is_never_silent(ros, clock, watch):
 
 A, B, OTHER = b'a', b'b', b'o'
 ONE, TWO = {A: '/go_to_goal'}, {A: '/go_to_goal', B: '/go_to_goal'}
-ANOTHER = (
-    'another controller /go_to_goal has started: the one with the goal was restarted, or two drive the '
-    'robot'
-)
-HANGS = 'the controller /go_to_goal has not answered for 3 s: it was killed or hangs'
 
 
-def test_loss():
+def test_why_a_controller_is_lost():
     for sent_to, present, silence, expected in (
         (ONE, ONE, 2.9, None),
         (ONE, {}, 0.0, 'the controller is gone'),
@@ -215,11 +193,12 @@ def test_loss():
         # One of them was killed before, or the goal was not sent.
         (TWO, TWO, 0.0, None),
         (TWO, ONE, 0.0, None),
-        (ONE, TWO, 0.0, ANOTHER),
-        (ONE, {B: '/go_to_goal'}, 0.0, ANOTHER),
-        (ONE, ONE, 3.0, HANGS),
+        (ONE, TWO, 0.0, 'another controller /go_to_goal has started'),
+        (ONE, {B: '/go_to_goal'}, 0.0, 'another controller /go_to_goal has started'),
+        (ONE, ONE, 3.0, 'the controller /go_to_goal has not answered for 3 s'),
     ):
-        assert loss(sent_to, present, silence) == expected
+        found = loss(sent_to, present, silence)
+        assert found is expected if expected is None else found.startswith(expected)
 
 
 @pytest.mark.parametrize('names', [('/go_to_goal', '/go_to_goal'), ('/first', '/second')])
@@ -229,10 +208,8 @@ def test_a_goal_is_not_sent_to_several_controllers_that_answer(ros, names):
     received = ros.listen(PoseStamped, 'goal_pose')
     result = send_goal([1.0, 0.0, 0.0], runner=Runner(ros.context, ros.executor))
     assert result.result is Result.SEVERAL
-    assert result.reason == (
-        f'several controllers answer, {listed(list(names))}: each would drive the robot; stop all but '
-        'one, or give each a namespace'
-    )
+    for name in names:
+        assert name in result.reason
     assert not received
 
 
@@ -252,12 +229,29 @@ class MuteController(Node):
         super().__init__('mute', context=context)
         self.heard = []
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._status = self.create_publisher(GoalStatus, 'goal_status', latched)
-        self.create_subscription(PoseStamped, 'goal_pose', lambda _: self.heard.append('goal'), 10)
-        self.create_service(Trigger, 'cancel_goal', self._on_cancel)
+        self.status = self.create_publisher(GoalStatus, 'goal_status', latched)
+        self.create_subscription(PoseStamped, 'goal_pose', self.on_goal, 10)
+        self.create_service(Trigger, 'cancel_goal', self.on_cancel)
 
-    def _on_cancel(self, _, response):
+    def on_goal(self, _):
+        self.heard.append('goal')
+
+    def on_cancel(self, _, response):
         self.heard.append('cancel')
+        return response
+
+
+class LateController(MuteController):
+    """Drives to a goal, and has arrived when it is asked to cancel."""
+
+    def on_goal(self, goal):
+        self.report = GoalStatus(status=GoalStatus.STATUS_EXECUTING)
+        self.report.goal_info.stamp = goal.header.stamp
+        self.status.publish(self.report)
+
+    def on_cancel(self, request, response):
+        self.report.status = GoalStatus.STATUS_SUCCEEDED
+        self.status.publish(self.report)
         return response
 
 
@@ -269,27 +263,6 @@ def test_a_goal_without_an_answer_is_withdrawn():
         runner.settle()
     assert result.result is Result.NO_ANSWER
     assert mute.heard == ['goal', 'cancel']
-
-
-class LateController(MuteController):
-    """Drives to a goal, and has arrived when it is asked to cancel."""
-
-    def __init__(self, context):
-        super().__init__(context)
-        self.create_subscription(PoseStamped, 'goal_pose', self._on_goal, 10)
-
-    def _on_goal(self, goal):
-        self._goal = goal
-        self._report(GoalStatus.STATUS_EXECUTING)
-
-    def _report(self, status):
-        message = GoalStatus(status=status)
-        message.goal_info.stamp = self._goal.header.stamp
-        self._status.publish(message)
-
-    def _on_cancel(self, request, response):
-        self._report(GoalStatus.STATUS_SUCCEEDED)
-        return super()._on_cancel(request, response)
 
 
 def test_a_robot_that_arrives_while_it_is_canceled_has_arrived():
@@ -342,54 +315,12 @@ def test_a_goal_of_a_robot_that_does_not_move_is_reported():
 def test_the_report_does_not_claim_that_an_unknown_robot_was_stopped(capsys):
     options = argparse.Namespace(timeout=7.0, wait=10.0, x=1.0, y=1.0)
     values = {'result': Result.TIMEOUT, 'topic': '/goal_pose', 'status': GoalState.CANCELED}
-    unknown = GoalResult(**values, canceled=True)
-    assert sending.report(unknown, options, 'goal (1, 1)') == [
-        'not arrived within --timeout 7 s',
-        'canceled: no odometry was received, so it is not known whether a robot drove',
-    ]
-    known = GoalResult(**values, canceled=True, distance=1.0)
-    assert sending.report(known, options, 'goal (1, 1)')[1] == 'canceled: the robot was stopped'
+    unknown = sending.report(GoalResult(**values, canceled=True), options, 'goal (1, 1)')
+    assert unknown[0] == 'not arrived within --timeout 7 s'
+    assert 'it is not known whether a robot drove' in unknown[1]
+    known = sending.report(GoalResult(**values, canceled=True, distance=1.0), options, 'goal (1, 1)')
+    assert known[1] == 'canceled: the robot was stopped'
     several = GoalResult(result=Result.SEVERAL, topic='/goal_pose', reason='several answer')
     assert sending.report(several, options, 'goal (1, 1)') == ['not sent: several answer']
     sending.Progress('send_goal', 'goal (1, 1)').standing(5.0)
-    assert capsys.readouterr().out == 'the robot has not moved for 5 s: call doctor to find out why\n'
-
-
-# --- Messages that clients ignore
-
-EVENT = ParameterEvent(changed_parameters=[Parameter('a', value=[1, 2]).to_parameter_msg()] * 60)
-
-
-@pytest.mark.parametrize(
-    ('codec', 'message'),
-    [
-        (GOAL_STATUS, GoalStatus()),
-        (ODOMETRY, odometry(1.0, 2.0, 0.0)),
-        (GOALS, goals(goal(1, 0), goal(2, 0))),
-        (PARAMETER_EVENT, EVENT),
-    ],
-    ids=lambda one: getattr(one, 'type_name', ''),
-)
-def test_invalid_messages_are_ignored_without_a_word(codec, message, capfd):
-    """The code that rclpy generates for a type writes a line for each."""
-    received, refused = [], []
-    callback = ignoring_invalid(codec, type(message), received.append, refused.append)
-    data = serialize_message(message)
-    # rclpy adds bytes at the end.
-    for invalid in (b'\0\1', b'\xff' * len(data), *(data[:end] for end in range(0, len(data) // 2, 4))):
-        callback(invalid)
-    assert received == []
-    callback(data)
-    assert received == [value_of(codec, message)]
-    assert refused == []
-    assert capfd.readouterr() == ('', '')
-
-
-def test_an_invalid_value_is_reported_and_what_is_too_large_is_not():
-    received, refused = [], []
-    callback = ignoring_invalid(ODOMETRY, Odometry, received.append, refused.append)
-    callback(serialize_message(odometry(1e7, 0.0, 0.0)))
-    callback(serialize_message(Odometry(child_frame_id='a' * serialization.MAX_SIZE)))
-    assert received == []
-    (error,) = refused
-    assert 'got x 1e+07, y 0' in str(error)
+    assert 'the robot has not moved for 5 s' in capsys.readouterr().out

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 import pytest
 
+from diffdrive_jacobian.control import (
+    VelocityLimits,
+    go_to_goal,
+    go_to_pose,
+    offset_point,
+    saturate,
+    turn_in_place,
+)
 from diffdrive_jacobian.messages.codecs import Route, State
 from diffdrive_jacobian.nodes.steering import Goal, Pursuit, Steering
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
@@ -33,6 +42,14 @@ def at(x, y, theta=0.0, twist=(0.0, 0.0)):
 
 def steering(before=None, **parameters):
     return Steering(GoToGoalParameters(**parameters), before)
+
+
+def command(steer, one, state, rate=RATE):
+    """Return the first command to a goal."""
+    return steer.command(Pursuit.of(one), state, SECOND, rate)[1]
+
+
+# --- Goals
 
 
 @pytest.mark.parametrize(
@@ -69,10 +86,10 @@ def test_the_same_path_has_the_same_poses_times_and_frame():
 def test_progress_is_another_value_and_the_same_question_has_the_same_answer():
     steer, begun = steering(), Pursuit.of(goal((1, 0), (1, 1)))
     state = at(0, 0)
-    after, command = steer.command(begun, state, SECOND, RATE)
+    after, first = steer.command(begun, state, SECOND, RATE)
     assert after is begun
-    assert command == (0.5, 0.0)
-    assert steer.command(begun, state, SECOND, RATE) == (after, command)
+    assert first == (0.5, 0.0)
+    assert steer.command(begun, state, SECOND, RATE) == (after, first)
     # The second one is to the left of the first.
     after, (v, omega) = steer.command(begun, at(1, 0), SECOND, RATE)
     assert (begun.index, after.index) == (0, 1)
@@ -81,27 +98,103 @@ def test_progress_is_another_value_and_the_same_question_has_the_same_answer():
     assert steer.command(after, at(1, 1), SECOND, RATE)[1] is None
 
 
-@pytest.mark.parametrize('limit', [0.1, 1.0])
-def test_commands_are_within_the_limits_on_the_same_curve(limit):
-    free = steering().command(Pursuit.of(goal((3, 1))), at(0, 0), SECOND, RATE)[1]
-    v, omega = steering(linear_x_max_velocity=limit).command(
-        Pursuit.of(goal((3, 1))), at(0, 0), SECOND, RATE
-    )[1]
-    assert v == limit
-    assert omega / v == pytest.approx(free[1] / free[0])
+# --- Laws
+
+LAWS = {
+    'go_to_goal': lambda pose, to, kp, kv, d: go_to_goal(pose, to[:2], kp, kv),
+    'offset_point': lambda pose, to, kp, kv, d: offset_point(pose, to[:2], kv, d),
+    'pose': lambda pose, to, kp, kv, d: go_to_pose(pose, to, kp, kv),
+}
+POSES = [(0.0, 0.0, 0.0), (2.0, 0.5, math.pi), (-1.0, -0.3, 1.5), (0.9, 1.2, -2.5), (-1e5, 1e5, 1.0)]
+PLAUSIBLE = VelocityLimits(min_v=-1e3, max_v=1e3, min_omega=-1e3, max_omega=1e3)
+
+
+def axle(x, y, theta, offset):
+    """Place the axle such that the point at an offset is at x, y."""
+    return at(x - offset * math.cos(theta), y - offset * math.sin(theta), theta)
+
+
+@pytest.mark.parametrize('name', LAWS)
+def test_each_pose_is_answered_by_the_law_that_was_chosen(name):
+    gains = {'kp': 5.0, 'kv': 1.5, 'offset': -0.2}
+    steer = steering(controller=name, **gains)
+    target, following = (1.0, 0.4, 2.0), (3.0, 3.0, 1.0)
+    pursuit = Pursuit.of(Goal('', np.array([target, following])))
+    for pose in POSES:
+        expected = saturate(*LAWS[name](pose, target, *gains.values()), PLAUSIBLE, 1.0, 1.0)
+        pursuit, found = steer.command(pursuit, at(*pose), SECOND, math.inf)
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
+    assert pursuit.index == 0
+    # A waypoint counts by its position, which is that of the driven point.
+    here = axle(*target[:2], 0.3, -0.2 if name == 'offset_point' else 0.0)
+    pursuit, found = steer.command(pursuit, here, SECOND, math.inf)
+    assert found == pytest.approx(LAWS[name](here.pose, following, *gains.values()), rel=1e-9)
+    assert pursuit.index == 1
+
+
+@pytest.mark.parametrize('name', LAWS)
+def test_where_the_heading_counts_the_robot_turns_in_place_at_the_end(name):
+    offset = 0.5 if name == 'offset_point' else 0.0
+    for use, heading in itertools.product((True, False), (-2.0, math.pi)):
+        steer = steering(controller=name, offset=0.5, yaw_goal_tolerance=0.1, use_goal_heading=use)
+        pursuit = Pursuit.of(Goal('', np.array([(0.0, 9.0, 1.0), (1.0, 0.0, heading)])))
+        pursuit, _ = steer.command(pursuit, axle(0.0, 9.0, math.pi / 2.0, offset), SECOND, RATE)
+        assert pursuit.index == 1
+        pursuit, found = steer.command(pursuit, axle(1.0, 0.0, 0.0, offset), SECOND, RATE)
+        # Pose always takes the heading.
+        if not use and name != 'pose':
+            assert found is None
+            continue
+        assert found == pytest.approx(turn_in_place(0.0, heading, 3.0))
+        # The position is not looked at any more, though the point swings off the goal.
+        pursuit, found = steer.command(pursuit, at(1.0, 0.1, heading - 0.2), SECOND, RATE)
+        assert found == pytest.approx((0.0, 0.6))
+        assert steer.command(pursuit, at(1.0, 0.1, heading - 0.09), SECOND, RATE)[1] is None
+
+
+def test_new_parameters_may_be_another_law_or_another_driven_point():
+    before = steering(controller='offset_point', offset=0.1)
+    assert not steering(before, controller='offset_point', offset=0.1, kp=1.0).drives_otherwise(before)
+    assert steering(before, controller='offset_point', offset=0.2).drives_otherwise(before)
+    assert steering(before).drives_otherwise(before)
+
+
+# --- Limits
+
+
+@pytest.mark.parametrize('target', [(5.0, 2.0), (-5.0, 0.1), (0.3, -2.0)])
+def test_limits_keep_the_curvature(target):
+    values = {
+        'linear_x_max_velocity': 0.1,
+        'linear_x_min_velocity': 0.0,
+        'angular_z_max_velocity': 2.0,
+        'angular_z_min_velocity': -0.3,
+    }
+    free = command(steering(), goal(target), at(0, 0))
+    limits = VelocityLimits(max_v=0.1, min_v=0.0, max_omega=2.0, min_omega=-0.3)
+    expected = pytest.approx(saturate(*free, limits, 1.0, 1.0))
+    assert command(steering(**values), goal(target), at(0, 0)) == expected
 
 
 def test_a_robot_does_not_turn_by_more_than_a_half_turn_between_two_messages():
-    pursuit, state, steer = Pursuit.of(goal((-1, 1e-3))), at(0, 0), steering(kp=100.0)
-    _, free = steer.command(pursuit, state, SECOND, math.inf)[1]
+    behind, steer = goal((-1, 1e-3)), steering(kp=100.0)
+    _, free = command(steer, behind, at(0, 0), math.inf)
     assert free == pytest.approx(100.0 * math.pi, rel=1e-3)
     for rate in (5.0, 30.0, 45.0):
-        _, omega = steer.command(pursuit, state, SECOND, rate)[1]
+        _, omega = command(steer, behind, at(0, 0), rate)
         assert abs(omega) <= math.pi * rate
         # Whole turns less: the robot faces there at the next message.
-        assert (free - omega) / (math.tau * rate) == pytest.approx(
-            round((free - omega) / (math.tau * rate))
-        )
+        turns = (free - omega) / (math.tau * rate)
+        assert turns == pytest.approx(round(turns))
+
+
+def test_a_robot_that_takes_time_is_told_to_stop_in_time():
+    state, near = at(0, 0, twist=(0.3, 0.0)), goal((0.2, 0))
+    slow = {'linear_x_max_acceleration': 0.2, 'stop_in_time': True}
+    assert command(steering(**slow), near, state)[0] < command(steering(), near, state)[0]
+
+
+# --- Paths
 
 
 def test_a_path_may_begin_only_so_far_from_the_robot():
@@ -131,10 +224,10 @@ def test_a_waypoint_that_was_missed_is_driven_to():
     now, missed = SECOND, []
     for x in np.arange(0.0, 2.0, 0.1):
         # Beside the first one.
-        after, command = steer.command(before, at(x, 0.2), now, RATE)
-        missed.append(after.missed)
-        assert command is not None
-        before, now = after, now + SECOND // 50
+        before, found = steer.command(before, at(x, 0.2), now, RATE)
+        missed.append(before.missed)
+        assert found is not None
+        now += SECOND // 50
     assert missed == sorted(missed)
     assert 0 < missed.count(True) < len(missed)
     assert before.follower is None
@@ -144,30 +237,14 @@ def test_a_waypoint_that_was_missed_is_driven_to():
 def test_the_end_of_a_path_is_a_goal_and_lateness_is_by_its_times():
     steer = steering()
     pursuit = Pursuit.of(path((0, 0), (1, 0), times=(0.0, 2.0)))
-    pursuit, command = steer.command(pursuit, at(0, 0), SECOND, RATE)
-    assert command is not None
+    pursuit, found = steer.command(pursuit, at(0, 0), SECOND, RATE)
+    assert found is not None
     assert (pursuit.first_step, pursuit.last_step) == (SECOND, SECOND)
     for x in np.arange(0.0, 1.01, 0.01):
         # Half as fast as by its times.
-        pursuit, command = steer.command(pursuit, at(x, 0), int((1.0 + 4.0 * x) * SECOND), RATE)
+        pursuit, found = steer.command(pursuit, at(x, 0), int((1.0 + 4.0 * x) * SECOND), RATE)
     assert pursuit.follower is None
-    assert command is None
+    assert found is None
     assert pursuit.lateness(5 * SECOND) == ', 2.0 s later than by its times'
     assert pursuit.lateness(2 * SECOND) == ', 0.0 s later than by its times'
     assert Pursuit.of(path((0, 0), (1, 0))).lateness(SECOND) == ''
-
-
-def test_a_robot_that_takes_time_is_told_to_stop_in_time():
-    slow = {'linear_x_max_acceleration': 0.2, 'stop_in_time': True}
-    v, _ = steering(**slow).command(
-        Pursuit.of(goal((0.2, 0))), at(0, 0, twist=(0.3, 0.0)), SECOND, RATE
-    )[1]
-    free, _ = steering().command(Pursuit.of(goal((0.2, 0))), at(0, 0, twist=(0.3, 0.0)), SECOND, RATE)[1]
-    assert v < free
-
-
-def test_new_parameters_may_be_another_law_or_another_driven_point():
-    before = steering(controller='offset_point', offset=0.1)
-    assert not steering(before, controller='offset_point', offset=0.1, kp=1.0).drives_otherwise(before)
-    assert steering(before, controller='offset_point', offset=0.2).drives_otherwise(before)
-    assert steering(before).drives_otherwise(before)

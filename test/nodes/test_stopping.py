@@ -1,4 +1,4 @@
-"""The node go_to_goal and robots that take time to stop: advice, a stop in time, arrival at rest."""
+"""Robots that take time to stop: predicted distances, braking in time, and arrival at rest."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ import pytest
 from action_msgs.msg import GoalStatus
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
-from support.lockstep_nodes import CANCELED, SUCCEEDED, Controller, Topics, change, make
+from support.lockstep_nodes import CANCELED, SUCCEEDED, Controller, Topics, make
 from support.ros_messages import at_rest, goal, odometry
 
-from diffdrive_jacobian.control import VelocityLimits
 from diffdrive_jacobian.drives import drive
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.stopping import overshoot_warnings, rolls_on
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loops
+from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 from diffdrive_jacobian.simulation.braking import Braking
 
@@ -33,6 +31,18 @@ ACTUATORS = Actuators(
     delay=200_000_000,
 )
 SECOND = 1_000_000_000
+PERIOD = SECOND // 50
+
+
+def travelled(robot):
+    """Return the distance and the turn by the wheels since the start."""
+    right, left = robot.wheel_angles
+    return 0.033 * (right + left) / 2.0, 0.033 * (right - left) / 0.16
+
+
+def stopped(robot):
+    """Return a robot that was commanded to stop, at rest."""
+    return robot.commanded((0.0, 0.0), robot.stamp).at(robot.stamp + 20 * SECOND)
 
 
 def test_a_robot_rolls_as_far_as_predicted():
@@ -40,15 +50,9 @@ def test_a_robot_rolls_as_far_as_predicted():
     for command in [(0.3, 0.0), (0.3, 1.0), (0.05, 0.9), (0.0, -0.2)]:
         # It has followed the command for long.
         robot = start.commanded(command, 0).at(20 * SECOND)
-        stopped = robot.commanded((0.0, 0.0), robot.stamp).at(40 * SECOND)
-        right, left = np.subtract(stopped.wheel_angles, robot.wheel_angles)
-        distance, turn = 0.033 * (right + left) / 2.0, 0.033 * (right - left) / 0.16
-        assert ACTUATORS.stopping_distance(command, robot.model) == pytest.approx(
-            (distance, turn), abs=1e-9
-        )
-
-
-PERIOD = SECOND // 50
+        rolled = np.subtract(travelled(stopped(robot)), travelled(robot))
+        expected = ACTUATORS.stopping_distance(command, robot.model)
+        assert rolled == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize('lag', [0.0, 0.1])
@@ -63,7 +67,6 @@ def test_a_braked_robot_comes_to_rest_within_the_room_wherever_it_is_stopped(lag
         room, turn = chance.uniform(0.0, 0.5), chance.choice((math.inf, chance.uniform(0.5, 3.0)))
         braking, stamp = Braking(actuators), 0
         robot = Robot(model=model, stamp=0, pose=(0.0, 0.0, 0.0))
-        command = chance.uniform(0.0, 0.5), chance.uniform(-1.0, 1.0)
         for number in range(150):
             if number % 25 == 0:
                 command = chance.uniform(0.0, 0.5), chance.uniform(-1.0, 1.0)
@@ -71,21 +74,14 @@ def test_a_braked_robot_comes_to_rest_within_the_room_wherever_it_is_stopped(lag
             v, omega = braking.limited(stamp, robot.twist, command, lambda _, left=left: left, 0.02)
             assert v * command[1] == pytest.approx(omega * command[0])
             braking.sent(stamp, (v, omega))
-            robot = robot.commanded((v, omega), stamp)
             stamp += PERIOD
-            robot = robot.at(stamp)
-            distance, turned = travelled(robot.commanded((0.0, 0.0), stamp).at(stamp + 20 * SECOND))
+            robot = robot.commanded((v, omega), robot.stamp).at(stamp)
+            distance, turned = travelled(stopped(robot))
             assert distance <= room + 1e-9
             assert abs(turned) <= turn + 1e-9
         used.append(max(distance / room, abs(turned) / turn))
     # It uses the room, and does not simply creep.
     assert np.median(used) > 0.95
-
-
-def travelled(robot):
-    """Return the distance and the turn by the wheels since the start."""
-    right, left = robot.wheel_angles
-    return 0.033 * (right + left) / 2.0, 0.033 * (right - left) / 0.16
 
 
 def test_braking_uses_the_twist_by_the_odometry_and_the_point_that_is_driven():
@@ -104,14 +100,12 @@ def test_braking_uses_the_twist_by_the_odometry_and_the_point_that_is_driven():
     assert (v, omega) == (0.0, pytest.approx(1.0, abs=1e-3))
 
 
-def test_braking_starts_anew_when_the_clock_is_set_back():
+def test_braking_is_reset_when_the_clock_is_set_back():
     braking = Braking(dataclasses.replace(ACTUATORS, lag=0.0))
     for stamp in (100 * SECOND, SECOND):
-        assert braking.limited(stamp, (0.3, 0.0), (0.3, 0.0), lambda _: (2.0, math.inf), 0.02) == (
-            0.3,
-            0.0,
-        )
-        braking.sent(stamp, (0.3, 0.0))
+        found = braking.limited(stamp, (0.3, 0.0), (0.3, 0.0), lambda _: (2.0, math.inf), 0.02)
+        assert found == (0.3, 0.0)
+        braking.sent(stamp, found)
 
 
 @pytest.mark.parametrize(
@@ -133,44 +127,6 @@ def test_a_robot_that_stops_in_time_arrives_and_rests_within_the_tolerance(goal,
     outcome = drive([goal], lockstep=True, timeout=60.0, parameters=parameters, robot_parameters=known)
     assert outcome.arrived
     assert outcome.distance <= 0.02 + fastest * 0.02
-
-
-def test_the_description_is_empty_where_nothing_is_to_be_said():
-    assert rolls_on(ACTUATORS, (0.2, 0.0)) == (
-        '; the robot rolls on for about 0.260 m and turns by 0.000 rad'
-    )
-    assert rolls_on(ACTUATORS, (0.0, 0.0)) == ''
-    assert rolls_on(Actuators(), (0.2, 0.0)) == rolls_on(ACTUATORS, (math.nan, 0.0)) == ''
-
-
-def test_the_advice_is_given_where_a_robot_overshoots():
-    """The law `v = kv distance`, straight on, with a limit and from far away."""
-    limits = VelocityLimits(max_v=0.6, max_omega=1.0, min_omega=-1.0)
-    actuators = Actuators(
-        acceleration=AccelerationLimits(v=AxisLimits(max_acceleration=1.0, max_deceleration=-0.2))
-    )
-    gains = [0.5, 0.6, 0.8, 1.5]
-    found = closed_loops(
-        lambda poses, goals, gain: (gain * (goals[..., 0] - poses[..., 0]), 0.0 * poses[..., 0]),
-        [0.0, 0.0, 0.0], [3.0, 0.0], gains,
-        limits=limits, actuators=actuators, duration=12.0, rate=20.0,
-    )  # fmt: skip
-    advice = [bool(overshoot_warnings(kv, None, limits, actuators)) for kv in gains]
-    # Up to the tolerance the robot may be fast without overshooting by more than that.
-    assert advice == (found.overshoot > 0.02).tolist() == [False, False, True, True]
-    fast = VelocityLimits(max_v=5.0)
-    assert overshoot_warnings(0.5, None, fast, actuators)
-    assert not overshoot_warnings(None, None, fast, actuators)
-    assert not overshoot_warnings(0.5, None, fast, Actuators())
-
-
-def test_the_node_logs_the_advice_and_not_with_a_stop_in_time(lockstep, capfd):
-    node = lockstep.add(make(GoToGoal, **{'linear.x.max_velocity': 1.0}))
-    assert 'too fast to stop' not in capfd.readouterr().err
-    assert change(node, **SLOW).successful
-    assert 'kv 0.5 lets the robot drive too fast to stop' in capfd.readouterr().err
-    assert change(node, stop_in_time=True, kv=0.6).successful
-    assert 'too fast to stop' not in capfd.readouterr().err
 
 
 STOPS = {'stop_in_time': True, 'trans_stopped_velocity': 0.01, 'rot_stopped_velocity': 0.01}

@@ -1,0 +1,342 @@
+"""What rclpy itself cannot parse, floods, and huge texts: refused, logged in short, and they end no node."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from nav_msgs.msg import Goals, Odometry
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterEvent, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from support.lockstep_nodes import ABORTED, ACCEPTED, CANCELED, EXECUTING, Controller, change
+from support.ros_messages import goal, goals, odometry, placement, twist, value_of
+from type_description_interfaces.srv import GetTypeDescription
+
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, ODOMETRY, PARAMETER_EVENT
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.goal_client import GoalClient
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
+from diffdrive_jacobian.ros import node as ros_node
+from diffdrive_jacobian.ros import serialization
+from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.ros.serialization import ignoring_invalid
+
+MEGABYTE = 1_000_000 * 'f'
+CONTROL_CHARACTERS = 5_000 * '\x1b[31m\n\u202e'
+
+
+@pytest.fixture
+def controller(lockstep):
+    return Controller(lockstep)
+
+
+# --- Parameter requests
+
+
+def double(name, value):
+    kind = ParameterType.PARAMETER_DOUBLE
+    return ParameterMessage(name=name, value=ParameterValue(type=kind, double_value=value))
+
+
+def of_type(name, number):
+    return ParameterMessage(name=name, value=ParameterValue(type=number))
+
+
+@pytest.fixture
+def set_parameters(lockstep):
+    """Send a request to go_to_goal; return the results."""
+
+    def call(*parameters):
+        request = SetParameters.Request(parameters=parameters)
+        return lockstep.call(SetParameters, 'go_to_goal/set_parameters', request).results
+
+    return call
+
+
+def test_a_value_of_an_unknown_type_is_refused_and_the_others_are_set(add_complete, set_parameters):
+    node = add_complete(GoToGoal)
+    for number in (10, 255):
+        value = 1.0 + number / 10.0
+        results = set_parameters(of_type('kp', number), double('kp', value), of_type('no such', number))
+        assert [one.successful for one in results] == [False, True, False]
+        assert f"parameter 'kp' must have a type in 0 to 9, got type {number}" in results[0].reason
+        assert node.get_parameter('kp').value == value
+
+
+def test_a_value_of_an_unknown_type_refuses_an_atomic_request(lockstep, add_complete):
+    node = add_complete(GoToGoal)
+
+    def result(*parameters):
+        request = SetParametersAtomically.Request(parameters=parameters)
+        service = 'go_to_goal/set_parameters_atomically'
+        return lockstep.call(SetParametersAtomically, service, request).result
+
+    before = node.parameters
+    assert not result(double('kp', 2.5), of_type('kv', 10), double('kp', 3.5)).successful
+    assert node.parameters == before
+    assert result(double('kp', 2.5), double('kp', 3.5)).successful
+    assert node.get_parameter('kp').value == 3.5
+
+
+def test_odd_names_are_refused_and_quoted_in_short(add_complete, set_parameters, capfd):
+    node = add_complete(GoToGoal)
+    (result,) = set_parameters(of_type('\x1b[2J' + 100_000 * 'n', 10))
+    lines = [one for one in capfd.readouterr().err.splitlines() if 'request refused: ' in one]
+    for text in (result.reason, lines[-1]):
+        assert len(text) < 300
+        assert r'\x1b[2Jnn' in text
+    (result,) = set_parameters(double('', 1.0))
+    assert (result.successful, result.reason) == (False, 'a parameter must have a name, got none')
+    assert not node.has_parameter('')
+    odd = ['', '.', '\n', 'kp.', 'kp.kp', '%s', '\x00', 1_000 * 'n', 'kp']
+    assert not any(one.successful for one in set_parameters(*(of_type(name, 0) for name in odd)))
+
+
+def test_an_exception_of_our_own_callbacks_is_not_caught(add_complete, set_parameters):
+    def fail(_):
+        raise ZeroDivisionError('of the node itself')
+
+    add_complete(GoToGoal).add_post_set_parameters_callback(fail)
+    with pytest.raises(ZeroDivisionError, match='of the node itself'):
+        set_parameters(of_type('kp', 10), double('kp', 2.5))
+
+
+def test_long_strings_are_refused_as_parameters(lockstep, add_complete):
+    robot = add_complete(VirtualRobot)
+    value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=10 * MEGABYTE)
+    request = SetParameters.Request(parameters=[ParameterMessage(name='odom_frame_id', value=value)])
+    (result,) = lockstep.call(SetParameters, 'virtual_robot/set_parameters', request).results
+    assert not result.successful
+    assert "'odom_frame_id' must be not empty and at most 256 characters, got 'fff" in result.reason
+    assert result.reason.endswith("...' (10000000 characters)")
+    assert len(result.reason) < 300
+    assert change(robot, odom_frame_id=256 * 'n').successful
+    assert not change(robot, odom_frame_id=257 * 'n').successful
+    for name in ('controller', 'kp'):
+        with pytest.raises(ParameterError) as caught:
+            GoToGoalParameters(**{name: MEGABYTE})
+        assert len(str(caught.value)) < 300
+
+
+def test_a_malformed_type_hash_is_refused_and_not_logged_and_others_are_described(ros, capfd):
+    node = ros.add(VirtualRobot)
+    (service,) = [one for one in node.services if one.srv_type is GetTypeDescription]
+    request = GetTypeDescription.Request(type_name='nav_msgs/msg/Odometry')
+    for malformed in ('', 'y' * 100_000, f'RIHS01_{"0" * 63}g', f'RIHS01_{"0" * 64}\n'):
+        capfd.readouterr()
+        request.type_hash = malformed
+        response = service.callback(request, GetTypeDescription.Response())
+        assert not response.successful
+        assert f'got {len(malformed)} other characters' in response.failure_reason
+        assert len(capfd.readouterr().err) < 300
+    (info,) = ros.peer.get_publishers_info_by_topic('/odom')
+    request.type_hash = str(info.topic_type_hash)
+    assert service.callback(request, GetTypeDescription.Response()).successful
+
+
+# --- /clock
+
+
+def clock(sec, nanosec=0):
+    message = Clock()
+    message.clock.sec, message.clock.nanosec = sec, nanosec
+    return message
+
+
+@pytest.mark.parametrize('later', [False, True])
+def test_a_node_survives_an_invalid_clock(ros, capfd, executor_kind, later):
+    """Also when simulated time is switched on later."""
+    node = ros.add(GoToGoal, parameters={'use_sim_time': not later})
+    if later:
+        assert node.set_parameters([Parameter('use_sim_time', value=True)])[0].successful
+    time = ros.talk(Clock, '/clock')
+    time.publish(clock(5))
+    ros.until(lambda: node.now() == 5_000_000_000, 'the time is known')
+    time.publish(clock(-1, 10**9))
+    ros.until_said(capfd, '/clock dropped: ', 'got sec -1, nanosec 1000000000')
+    assert node.now() == 5_000_000_000
+    time.publish(clock(6))
+    ros.until(lambda: node.now() == 6_000_000_000, 'time goes on')
+
+
+def client(context):
+    return GoalClient('client', np.zeros((2, 3)), context)
+
+
+def plain(context):
+    return Node('plain', context=context)
+
+
+@pytest.mark.parametrize(('make', 'isolated'), [(client, True), (plain, False)])
+def test_a_runner_guards_the_nodes_of_the_tools(capfd, make, isolated):
+    arguments = ['test', '--ros-args', '-p', 'use_sim_time:=true']
+    with ros_context(arguments) as context, running(context, isolated=isolated) as runner:
+        node = runner.add(lambda: make(context))
+        peer = runner.add(lambda: Node('peer', context=context))
+        time = peer.create_publisher(Clock, '/clock', 10)
+        assert runner.spin(lambda: time.get_subscription_count() == 2)
+        time.publish(clock(-1))
+        assert runner.spin(lambda: '/clock dropped: ' in capfd.readouterr().err)
+        time.publish(clock(6))
+        assert runner.spin(lambda: node.get_clock().now().nanoseconds == 6_000_000_000)
+        parameters = peer.create_client(SetParameters, f'{node.get_name()}/set_parameters')
+        assert runner.spin(parameters.service_is_ready)
+        future = parameters.call_async(SetParameters.Request(parameters=[of_type('use_sim_time', 10)]))
+        assert runner.spin(future.done)
+        assert not future.result().results[0].successful
+
+
+# --- Floods
+
+FLOOD = 40
+MOST_LINES = 30
+"""More than EVENT_BURST lines, and what EVENT_PERIOD adds on a slow machine."""
+
+
+def assert_a_few(capfd, *words):
+    written = capfd.readouterr().err
+    for one in words:
+        assert ros_node.EVENT_BURST <= written.count(one) <= MOST_LINES, one
+
+
+def test_a_flood_of_goals_has_a_status_each_and_a_few_log_lines(controller, capfd):
+    for number in range(1, FLOOD):
+        controller.send(goal(1, 0, stamp=number))
+        controller.send(goal(9e9, 0, stamp=1000 + number))
+    assert_a_few(capfd, 'goal accepted: ', 'goal refused: ')
+    for number in range(1, FLOOD - 1):
+        statuses = [status for stamp, status in controller.statuses if stamp in (number, 1000 + number)]
+        assert statuses == [ACCEPTED, ABORTED, ACCEPTED, CANCELED]
+
+
+def test_events_of_the_nodes_are_logged_a_few_times(lockstep, add, controller, capfd):
+    change(controller.node, odom_timeout=0.001)
+    for _ in range(FLOOD):
+        controller.send(goal(1, 0))
+        lockstep.run_for(0.002)
+        assert lockstep.call(Trigger, 'cancel_goal').success
+    assert_a_few(capfd, 'the goal waits for odometry', 'goal canceled')
+    controller.send(goal(1, 0))
+    for number in range(FLOOD):
+        controller.sees(odometry(0, 0, 0))
+        lockstep.run_for(0.002)
+        change(controller.node, kp=0.1 + 0.001 * number)
+    assert_a_few(capfd, 'no valid odometry', 'odometry is received again', 'is not larger than kv')
+    lockstep.remove(controller.node)
+    add(VirtualRobot)
+    add(WheelBridge, cmd_vel_timeout=0.001)
+    for number in range(FLOOD):
+        lockstep.publish('initialpose', placement(number))
+        lockstep.publish('cmd_vel', twist(1, 0))
+        lockstep.run_for(0.002)
+        lockstep.jump(-0.003)
+    assert_a_few(capfd, 'pose set to', 'the wheels are stopped', 'time went back')
+
+
+# --- Long and malformed messages
+
+
+@pytest.mark.parametrize('text', [MEGABYTE, CONTROL_CHARACTERS])
+def test_long_frames_are_quoted_in_short(lockstep, controller, capfd, text):
+    lockstep.add(VirtualRobot())
+    controller.sees(odometry(0, 0, 0, frame=text))
+    controller.send(goal(1, 0, frame=text[1:]))
+    controller.send(goals(goal(1, 0, frame=text), goal(1, 0, frame='b'), frame=text[1:]))
+    controller.send(goal(1, 0))
+    controller.sees(odometry(0, 0, 0, frame=text))
+    controller.sees(odometry(0, 0, 0, frame='other'))
+    lockstep.publish('initialpose', placement(0, frame=text))
+    written = capfd.readouterr().err
+    for words in ('in the frame of the', 'in one frame, got', 'it must stay in frame', 'frame must be'):
+        assert words in written
+    assert max(map(len, written.splitlines())) < 600
+    assert '\x1b' not in written
+    assert '\u202e' not in written
+
+
+def test_long_and_many_joint_names_are_quoted_in_short(lockstep, add, capfd):
+    add(VirtualRobot, command_interface='wheels')
+    names = [MEGABYTE, *(f'joint {number}' for number in range(10_000))]
+    lockstep.publish('joint_command', JointState(name=names, velocity=[0.0] * len(names)))
+    (line,) = [one for one in capfd.readouterr().err.splitlines() if 'command dropped' in one]
+    assert line.endswith("'joint 2', ... (10001 in all)]")
+    assert len(line) < 500
+
+
+def big_endian_goals(count):
+    """Serialize that many poses of zeros, without frames, in an encapsulation that only rclpy reads."""
+    header = struct.pack('>iII', 2, 0, 1) + bytes(4)
+    return b'\0\2\0\0' + header + struct.pack('>I', count) + bytes(72 * count)
+
+
+def test_bytes_that_are_no_goals_or_too_many_to_convert_are_dropped(lockstep, controller, capfd):
+    publisher = lockstep.node.create_publisher(Goals, 'goals', 10)
+
+    def publish(data):
+        publisher.publish(data)
+        lockstep.settle()
+
+    publish(big_endian_goals(10))
+    assert controller.statuses == [(2, ABORTED)]
+    publish(big_endian_goals(MAX_WAYPOINTS + 1000))
+    assert f'goals must contain 1 to {MAX_WAYPOINTS} poses' in capfd.readouterr().err
+    publish(big_endian_goals(30_000))
+    assert 'goals dropped: it must have at most 2097152 bytes, got 21600' in capfd.readouterr().err
+    publish(serialize_message(goals(goal(1, 0), goal(2, 0)))[:-50])
+    publish(serialize_message(goals())[:-4] + b'\x05\0\0\0')
+    # One of them has a header.
+    assert set(controller.statuses[2:]) <= {(0, ABORTED)}
+    controller.send(goal(1, 0, stamp=3))
+    assert controller.at(0, 0) == (0.5, 0.0)
+    assert controller.statuses[-1] == (3, EXECUTING)
+
+
+EVENT = ParameterEvent(changed_parameters=[Parameter('a', value=[1, 2]).to_parameter_msg()] * 60)
+
+
+@pytest.mark.parametrize(
+    ('codec', 'message'),
+    [
+        (GOAL_STATUS, GoalStatus()),
+        (ODOMETRY, odometry(1.0, 2.0, 0.0)),
+        (GOALS, goals(goal(1, 0), goal(2, 0))),
+        (PARAMETER_EVENT, EVENT),
+    ],
+    ids=lambda one: getattr(one, 'type_name', ''),
+)
+def test_clients_ignore_invalid_messages_without_a_word(codec, message, capfd):
+    """The code that rclpy generates for a type writes a line for each."""
+    received, refused = [], []
+    callback = ignoring_invalid(codec, type(message), received.append, refused.append)
+    data = serialize_message(message)
+    # rclpy adds bytes at the end.
+    for invalid in (b'\0\1', b'\xff' * len(data), *(data[:end] for end in range(0, len(data) // 2, 4))):
+        callback(invalid)
+    assert received == []
+    callback(data)
+    assert received == [value_of(codec, message)]
+    assert refused == []
+    assert capfd.readouterr() == ('', '')
+
+
+def test_clients_report_an_invalid_value_and_not_what_is_too_large():
+    received, refused = [], []
+    callback = ignoring_invalid(ODOMETRY, Odometry, received.append, refused.append)
+    callback(serialize_message(odometry(1e7, 0.0, 0.0)))
+    callback(serialize_message(Odometry(child_frame_id='a' * serialization.MAX_SIZE)))
+    assert received == []
+    (error,) = refused
+    assert 'got x 1e+07, y 0' in str(error)
