@@ -52,17 +52,11 @@ def command(steer, one, state, rate=RATE):
 # --- Goals
 
 
-@pytest.mark.parametrize(
-    ('one', 'words'),
-    [
-        (goal((1, 2)), 'x 1.000, y 2.000'),
-        (goal((0, 0), (1, 2)), '2 waypoints, the last at x 1.000, y 2.000'),
-        (path((0, 0), (0, 2)), 'path of 2.00 m through 2 poses, the last at x 0.000, y 2.000'),
-        (path((0, 0), (0, 2), times=(0.0, 4.0)), 'path of 2.00 m in 4.0 s through 2 poses, the last at'),
-    ],
-)
-def test_a_goal_describes_itself(one, words):
-    assert str(one).startswith(words)
+def test_a_goal_describes_itself():
+    assert str(goal((1, 2))) == 'x 1.000, y 2.000'
+    assert str(goal((0, 0), (1, 2))) == '2 waypoints, the last at x 1.000, y 2.000'
+    trajectory = path((0, 0), (0, 2), times=(0.0, 4.0))
+    assert str(trajectory).startswith('path of 2.00 m in 4.0 s through 2 poses, the last at x 0.000')
 
 
 def test_the_same_path_has_the_same_poses_times_and_frame():
@@ -152,13 +146,6 @@ def test_where_the_heading_counts_the_robot_turns_in_place_at_the_end(name):
         assert steer.command(pursuit, at(1.0, 0.1, heading - 0.09), SECOND, RATE)[1] is None
 
 
-def test_new_parameters_may_be_another_law_or_another_driven_point():
-    before = steering(controller='offset_point', offset=0.1)
-    assert not steering(before, controller='offset_point', offset=0.1, kp=1.0).drives_otherwise(before)
-    assert steering(before, controller='offset_point', offset=0.2).drives_otherwise(before)
-    assert steering(before).drives_otherwise(before)
-
-
 # --- Limits
 
 
@@ -188,12 +175,6 @@ def test_a_robot_does_not_turn_by_more_than_a_half_turn_between_two_messages():
         assert turns == pytest.approx(round(turns))
 
 
-def test_a_robot_that_takes_time_is_told_to_stop_in_time():
-    state, near = at(0, 0, twist=(0.3, 0.0)), goal((0.2, 0))
-    slow = {'linear_x_max_acceleration': 0.2, 'stop_in_time': True}
-    assert command(steering(**slow), near, state)[0] < command(steering(), near, state)[0]
-
-
 # --- Paths
 
 
@@ -216,22 +197,6 @@ def test_waypoints_are_passed_along_a_path_from_the_robot_if_chosen():
     # One goal, and goals where the robot is, have no path.
     for places in ([(1, 0)], [(0, 0), (0, 0)]):
         assert steer.begin(Pursuit.of(goal(*places)), (0.0, 0.0, 0.0)).follower is None
-
-
-def test_a_waypoint_that_was_missed_is_driven_to():
-    steer = steering(pass_waypoints=True, waypoint_tolerance=0.05)
-    before = steer.begin(Pursuit.of(goal((1, 0), (2, 0), (3, 0))), (0.0, 0.0, 0.0))
-    now, missed = SECOND, []
-    for x in np.arange(0.0, 2.0, 0.1):
-        # Beside the first one.
-        before, found = steer.command(before, at(x, 0.2), now, RATE)
-        missed.append(before.missed)
-        assert found is not None
-        now += SECOND // 50
-    assert missed == sorted(missed)
-    assert 0 < missed.count(True) < len(missed)
-    assert before.follower is None
-    assert before.index == 0
 
 
 def test_the_end_of_a_path_is_a_goal_and_lateness_is_by_its_times():
