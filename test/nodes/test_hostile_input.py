@@ -1,4 +1,4 @@
-"""What rclpy itself cannot parse, floods, and huge texts: refused, logged in short, and they end no node."""
+"""What rclpy itself cannot parse, floods and huge texts: refused, logged in short, ending no node."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from action_msgs.msg import GoalStatus
 from nav_msgs.msg import Goals, Odometry
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterEvent, ParameterType, ParameterValue
+from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -21,14 +21,11 @@ from support.lockstep_nodes import ABORTED, ACCEPTED, CANCELED, EXECUTING, Contr
 from support.ros_messages import goal, goals, odometry, placement, twist, value_of
 from type_description_interfaces.srv import GetTypeDescription
 
-from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, ODOMETRY, PARAMETER_EVENT
-from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, ODOMETRY
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.parameters.declaration import ParameterError
-from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.ros import node as ros_node
 from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.runner import ros_context, running
@@ -66,29 +63,20 @@ def set_parameters(lockstep):
     return call
 
 
-def test_a_value_of_an_unknown_type_is_refused_and_the_others_are_set(add_complete, set_parameters):
+def test_a_value_of_an_unknown_type_is_refused_and_the_others_are_set(
+    lockstep, add_complete, set_parameters
+):
     node = add_complete(GoToGoal)
-    for number in (10, 255):
-        value = 1.0 + number / 10.0
-        results = set_parameters(of_type('kp', number), double('kp', value), of_type('no such', number))
-        assert [one.successful for one in results] == [False, True, False]
-        assert f"parameter 'kp' must have a type in 0 to 9, got type {number}" in results[0].reason
-        assert node.get_parameter('kp').value == value
-
-
-def test_a_value_of_an_unknown_type_refuses_an_atomic_request(lockstep, add_complete):
-    node = add_complete(GoToGoal)
-
-    def result(*parameters):
-        request = SetParametersAtomically.Request(parameters=parameters)
+    results = set_parameters(of_type('kp', 10), double('kp', 2.0), of_type('no such', 255))
+    assert [one.successful for one in results] == [False, True, False]
+    assert "parameter 'kp' must have a type in 0 to 9, got type 10" in results[0].reason
+    assert node.parameters.kp == 2.0
+    # Of an atomic request nothing is set.
+    for others, expected in (([of_type('kv', 10)], 2.0), ([], 4.0)):
+        request = SetParametersAtomically.Request(parameters=[double('kp', 4.0), *others])
         service = 'go_to_goal/set_parameters_atomically'
-        return lockstep.call(SetParametersAtomically, service, request).result
-
-    before = node.parameters
-    assert not result(double('kp', 2.5), of_type('kv', 10), double('kp', 3.5)).successful
-    assert node.parameters == before
-    assert result(double('kp', 2.5), double('kp', 3.5)).successful
-    assert node.get_parameter('kp').value == 3.5
+        result = lockstep.call(SetParametersAtomically, service, request).result
+        assert (result.successful, node.parameters.kp) == (not others, expected)
 
 
 def test_odd_names_are_refused_and_quoted_in_short(add_complete, set_parameters, capfd):
@@ -107,10 +95,10 @@ def test_odd_names_are_refused_and_quoted_in_short(add_complete, set_parameters,
 
 def test_an_exception_of_our_own_callbacks_is_not_caught(add_complete, set_parameters):
     def fail(_):
-        raise ZeroDivisionError('of the node itself')
+        raise ZeroDivisionError
 
     add_complete(GoToGoal).add_post_set_parameters_callback(fail)
-    with pytest.raises(ZeroDivisionError, match='of the node itself'):
+    with pytest.raises(ZeroDivisionError):
         set_parameters(of_type('kp', 10), double('kp', 2.5))
 
 
@@ -125,10 +113,6 @@ def test_long_strings_are_refused_as_parameters(lockstep, add_complete):
     assert len(result.reason) < 300
     assert change(robot, odom_frame_id=256 * 'n').successful
     assert not change(robot, odom_frame_id=257 * 'n').successful
-    for name in ('controller', 'kp'):
-        with pytest.raises(ParameterError) as caught:
-            GoToGoalParameters(**{name: MEGABYTE})
-        assert len(str(caught.value)) < 300
 
 
 def test_a_malformed_type_hash_is_refused_and_not_logged_and_others_are_described(ros, capfd):
@@ -224,17 +208,14 @@ def test_a_flood_of_goals_has_a_status_each_and_a_few_log_lines(controller, capf
 
 def test_events_of_the_nodes_are_logged_a_few_times(lockstep, add, controller, capfd):
     change(controller.node, odom_timeout=0.001)
-    for _ in range(FLOOD):
+    for number in range(FLOOD):
         controller.send(goal(1, 0))
         lockstep.run_for(0.002)
-        assert lockstep.call(Trigger, 'cancel_goal').success
-    assert_a_few(capfd, 'the goal waits for odometry', 'goal canceled')
-    controller.send(goal(1, 0))
-    for number in range(FLOOD):
         controller.sees(odometry(0, 0, 0))
         lockstep.run_for(0.002)
         change(controller.node, kp=0.1 + 0.001 * number)
-    assert_a_few(capfd, 'no valid odometry', 'odometry is received again', 'is not larger than kv')
+        assert lockstep.call(Trigger, 'cancel_goal').success
+    assert_a_few(capfd, 'the goal waits', 'no valid odometry', 'is not larger than kv', 'goal canceled')
     lockstep.remove(controller.node)
     add(VirtualRobot)
     add(WheelBridge, cmd_vel_timeout=0.001)
@@ -284,51 +265,30 @@ def big_endian_goals(count):
 
 def test_bytes_that_are_no_goals_or_too_many_to_convert_are_dropped(lockstep, controller, capfd):
     publisher = lockstep.node.create_publisher(Goals, 'goals', 10)
-
-    def publish(data):
+    cut_off = serialize_message(goals(goal(1, 0), goal(2, 0)))[:-50]
+    for data in (big_endian_goals(10), big_endian_goals(30_000), cut_off):
         publisher.publish(data)
         lockstep.settle()
-
-    publish(big_endian_goals(10))
     assert controller.statuses == [(2, ABORTED)]
-    publish(big_endian_goals(MAX_WAYPOINTS + 1000))
-    assert f'goals must contain 1 to {MAX_WAYPOINTS} poses' in capfd.readouterr().err
-    publish(big_endian_goals(30_000))
     assert 'goals dropped: it must have at most 2097152 bytes, got 21600' in capfd.readouterr().err
-    publish(serialize_message(goals(goal(1, 0), goal(2, 0)))[:-50])
-    publish(serialize_message(goals())[:-4] + b'\x05\0\0\0')
-    # One of them has a header.
-    assert set(controller.statuses[2:]) <= {(0, ABORTED)}
     controller.send(goal(1, 0, stamp=3))
     assert controller.at(0, 0) == (0.5, 0.0)
     assert controller.statuses[-1] == (3, EXECUTING)
 
 
-EVENT = ParameterEvent(changed_parameters=[Parameter('a', value=[1, 2]).to_parameter_msg()] * 60)
-
-
-@pytest.mark.parametrize(
-    ('codec', 'message'),
-    [
-        (GOAL_STATUS, GoalStatus()),
-        (ODOMETRY, odometry(1.0, 2.0, 0.0)),
-        (GOALS, goals(goal(1, 0), goal(2, 0))),
-        (PARAMETER_EVENT, EVENT),
-    ],
-    ids=lambda one: getattr(one, 'type_name', ''),
-)
-def test_clients_ignore_invalid_messages_without_a_word(codec, message, capfd):
+def test_clients_ignore_invalid_messages_without_a_word(capfd):
     """The code that rclpy generates for a type writes a line for each."""
-    received, refused = [], []
-    callback = ignoring_invalid(codec, type(message), received.append, refused.append)
-    data = serialize_message(message)
-    # rclpy adds bytes at the end.
-    for invalid in (b'\0\1', b'\xff' * len(data), *(data[:end] for end in range(0, len(data) // 2, 4))):
-        callback(invalid)
-    assert received == []
-    callback(data)
-    assert received == [value_of(codec, message)]
-    assert refused == []
+    for codec, message in ((GOAL_STATUS, GoalStatus()), (GOALS, goals(goal(1, 0), goal(2, 0)))):
+        received, refused = [], []
+        callback = ignoring_invalid(codec, type(message), received.append, refused.append)
+        data = serialize_message(message)
+        # rclpy adds bytes at the end.
+        for invalid in (b'\0\1', b'\xff' * len(data), *(data[:end] for end in range(len(data) // 2))):
+            callback(invalid)
+        assert received == []
+        callback(data)
+        assert received == [value_of(codec, message)]
+        assert refused == []
     assert capfd.readouterr() == ('', '')
 
 
