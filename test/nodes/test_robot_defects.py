@@ -48,14 +48,13 @@ def bench():
     return Bench()
 
 
-def radius(factor):
-    return lambda model: replace(model, wheel_radius=factor * model.wheel_radius)
-
-
 def test_changes_apply_in_the_order_of_the_calls_until_they_end(bench):
+    def with_radius(factor, offset=0.0):
+        return lambda model: replace(model, wheel_radius=factor * model.wheel_radius + offset)
+
     start = bench.nominal.wheel_radius
-    end_first = bench.defects.change(lambda model: replace(model, wheel_radius=1.0))
-    end_second = bench.defects.change(radius(2.0))
+    end_first = bench.defects.change(with_radius(0.0, 1.0))
+    end_second = bench.defects.change(with_radius(2.0))
     assert bench.robot.model.wheel_radius == 2.0
     end_first()
     assert bench.robot.model.wheel_radius == 2.0 * start
@@ -103,16 +102,12 @@ def test_coarse_encoders_are_read_when_the_robot_reports(bench):
         bench.defects.set_encoders(0)
 
 
-def test_other_encoders_go_on_from_the_pose_of_those_before(bench):
+def test_encoders_go_on_from_the_pose_of_those_before_or_where_the_odometry_is_placed(bench):
     bench.defects.set_encoders(4)
     bench.now += SECOND // 3
     before = bench.reported().pose_tuple
     bench.defects.set_encoders(5)
     assert bench.placed == [before]
     assert bench.reported().pose_tuple == before
-
-
-def test_encoders_count_on_from_where_the_odometry_is_placed(bench):
-    bench.defects.set_encoders(1000)
     bench.place(bench.robot.placed(np.array([5.0, 5.0, 0.0]), np.zeros((3, 3)), bench.now))
     assert bench.defects.odometry_pose(bench.robot).tolist() == [5.0, 5.0, 0.0]

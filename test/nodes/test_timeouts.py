@@ -13,22 +13,25 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 
+KINDS = {
+    'virtual_robot': (VirtualRobot, 'cmd_vel_timeout', {}, TwistStamped, 'cmd_vel_out'),
+    'wheel_bridge': (WheelBridge, 'cmd_vel_timeout', {}, JointState, 'joint_command'),
+    'go_to_goal': (
+        *(GoToGoal, 'odom_timeout', {'enable_stamped_cmd_vel': True}),
+        *(TwistStamped, 'cmd_vel'),
+    ),
+}
+"""Class, parameter of the timeout, further parameters, and what the node sends."""
+
 
 class Driven:
     """A node that something must be sent to, and what it lets the robot do."""
 
     def __init__(self, lockstep, add, name, timeout):
-        kinds = {'virtual_robot': VirtualRobot, 'wheel_bridge': WheelBridge, 'go_to_goal': GoToGoal}
+        kind, self.parameter, others, message, topic = KINDS[name]
         self.lockstep, self.name = lockstep, name
-        self.parameter = 'odom_timeout' if name == 'go_to_goal' else 'cmd_vel_timeout'
-        stamped = {'enable_stamped_cmd_vel': True} if name == 'go_to_goal' else {}
-        kind, topic = {
-            'virtual_robot': (TwistStamped, 'cmd_vel_out'),
-            'wheel_bridge': (JointState, 'joint_command'),
-            'go_to_goal': (TwistStamped, 'cmd_vel'),
-        }[name]
-        self.out = lockstep.listen(kind, topic)
-        self.node = add(kinds[name], **{self.parameter: timeout}, **stamped)
+        self.out = lockstep.listen(message, topic)
+        self.node = add(kind, **{self.parameter: timeout}, **others)
         if name == 'go_to_goal':
             lockstep.publish('goal_pose', goal(1.0, 0.0))
 
@@ -56,7 +59,7 @@ def _moves(message):
     return bool(any(message.velocity) if isinstance(message, JointState) else message.twist.linear.x)
 
 
-@pytest.fixture(params=['virtual_robot', 'wheel_bridge', 'go_to_goal'])
+@pytest.fixture(params=KINDS)
 def create(lockstep, add, request):
     """Create one of the nodes, with a timeout (s)."""
     return lambda timeout=0.5: Driven(lockstep, add, request.param, timeout)

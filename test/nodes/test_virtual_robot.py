@@ -53,29 +53,26 @@ def driving(lockstep, add):
 # --- Motion
 
 
-def test_idle_robots_report_their_initial_poses(lockstep, add):
-    poses = {'a': ((1.0, -2.0, 4.0), 4.0 - math.tau), 'b': ((1e6, -1e6, -math.pi), math.pi)}
-    robots = {name: Topics(lockstep, name) for name in poses}
-    for name, ((x, y, theta), _) in poses.items():
-        add(VirtualRobot, name, x=x, y=y, theta=theta, odom_frame_id='o')
+def test_an_idle_robot_reports_its_initial_pose(lockstep, add):
+    topics = Topics(lockstep)
+    add(VirtualRobot, x=1.0, y=-2.0, theta=4.0, odom_frame_id='o')
     lockstep.run_for(0.1)
-    for name, ((x, y, _), theta) in poses.items():
-        topics, expected = robots[name], pose_message([x, y, theta])
-        assert instants(topics.odom) == [SECOND + SECOND // 50 * k for k in range(6)]
-        assert instants(topics.states) == instants(topics.odom)
-        odometry, states = topics.odom[-1], topics.states[-1]
-        assert odometry.pose.pose == expected
-        assert (odometry.header.frame_id, odometry.child_frame_id) == ('o', 'base_link')
-        assert not np.any(odometry.pose.covariance)
-        assert odometry.twist.twist == Twist()
-        assert list(states.name) == WHEELS
-        assert list(states.position) == list(states.velocity) == [0.0, 0.0]
-        assert topics.applied == []
-        (start,) = topics.starts
-        assert (start.pose.pose, time_of(start)) == (expected, SECOND)
+    assert instants(topics.odom) == [SECOND + SECOND // 50 * k for k in range(6)]
+    assert instants(topics.states) == instants(topics.odom)
+    odometry, states = topics.odom[-1], topics.states[-1]
+    expected = pose_message([1.0, -2.0, 4.0 - math.tau])
+    assert odometry.pose.pose == expected
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ('o', 'base_link')
+    assert not np.any(odometry.pose.covariance)
+    assert odometry.twist.twist == Twist()
+    assert list(states.name) == WHEELS
+    assert list(states.position) == list(states.velocity) == [0.0, 0.0]
+    assert topics.applied == []
+    (start,) = topics.starts
+    assert (start.pose.pose, time_of(start)) == (expected, SECOND)
     # It is latched.
-    lockstep.publish('a/initialpose', placement(2.0))
-    latched = lockstep.listen(type(start), 'a/start_pose', latched=True)
+    lockstep.publish('initialpose', placement(2.0))
+    latched = lockstep.listen(type(start), 'start_pose', latched=True)
     assert [one.pose.pose.position.x for one in latched] == [1.0, 2.0]
 
 
@@ -87,10 +84,7 @@ def test_every_pose_lies_on_the_exact_arc_of_the_command(lockstep, robot_at, int
     factors = [multipliers.get(name, 1.0) for name in UNEQUAL]
     left_radius, right_radius, separation = np.multiply([0.033, 0.033, 0.16], factors)
     angles = np.zeros(2)
-    for command in [
-        *[(0.22, 0.0), (0.0, -7.3), (-0.5, 3.0 * math.pi / 4.0), (0.4, -1e-12), (1.0, 1e-5)],
-        *[(1000.0, 1000.0), (0.0, 0.0)],
-    ]:
+    for command in [(0.22, 0.0), (-0.5, 3.0 * math.pi / 4.0), (1.0, 1e-5), (1e3, 1e3), (0.0, 0.0)]:
         v, omega = command
         rims = v - omega * separation / 2.0, v + omega * separation / 2.0
         speeds = np.divide(rims, (left_radius, right_radius))
@@ -116,7 +110,7 @@ def test_every_pose_lies_on_the_exact_arc_of_the_command(lockstep, robot_at, int
 
 
 def test_publish_rate_sets_the_times_of_odometry_and_changes_no_bit_of_the_pose(lockstep, add):
-    rates = {'a': 7.0, 'b': 50.0, 'c': 333.0}
+    rates = {'a': 7.0, 'b': 333.0}
     robots = {name: Topics(lockstep, name) for name in rates}
     for name, rate in rates.items():
         add(VirtualRobot, name, publish_rate=rate)
@@ -172,34 +166,17 @@ def test_wheels_and_twist_end_at_the_same_pose_and_the_faster_wheel_has_the_limi
     assert speeds.max() == pytest.approx(9.0)
 
 
-def test_wheel_speeds_stay_when_the_wheels_change_and_are_limited_alike(lockstep, add):
-    topics = Topics(lockstep)
-    robot = add(VirtualRobot, command_interface='wheels')
-    lockstep.publish('joint_command', joint_command(5.0, 10.0))
+def test_uncertainty_grows_with_the_variance_of_the_wheels(lockstep, add):
+    topics, variance = Topics(lockstep), 1e-5
+    robot = add(VirtualRobot, wheel_travel_variance=0.0)
+    lockstep.publish('cmd_vel', twist(1.0, 0.0))
     lockstep.run_for(0.2)
-    assert change(robot, wheel_radius=0.066).successful
-    lockstep.run_for(0.5)
-    first, second, zero = twists(topics.applied)
-    assert second == pytest.approx((2.0 * first[0], 2.0 * first[1]), rel=1e-15)
-    assert zero == (0.0, 0.0)
-    # The timeout counts from the command.
-    assert instants(topics.applied) == [SECOND, SECOND + SECOND // 5, SECOND + SECOND // 2]
-    assert list(topics.states[-1].position) == pytest.approx([2.5, 5.0], rel=1e-14)
-    assert change(robot, max_wheel_velocity=5.0).successful
-    lockstep.publish('joint_command', joint_command(-4.0, 10.0))
-    lockstep.run_for(0.04)
-    assert list(topics.states[-1].velocity) == pytest.approx([-2.0, 5.0], rel=1e-14)
-
-
-def test_odometry_by_encoders_starts_again_where_start_pose_says(lockstep, add):
-    topics, robot = Topics(lockstep), add(VirtualRobot)
-    robot.defects.set_encoders(4)
-    lockstep.publish('cmd_vel', twist(0.3, 0.0))
-    lockstep.run_for(0.4)
-    assert pose_of(topics.odom[-1])[0] != pytest.approx(0.12)
-    lockstep.jump(-0.2)
-    lockstep.run_for(0.02)
-    assert pose_of(topics.odom[-1]) == pytest.approx(pose_of(topics.starts[-1]))
+    assert not np.any(covariance_of(topics.odom[-1]))
+    assert change(robot, wheel_travel_variance=variance).successful
+    lockstep.run_for(0.2)
+    arc = ((1.0, 0.0), 0.2, 0.16, variance)
+    expected = propagate_moments(gaussian(np.zeros((3, 3))), np.zeros(3), *arc).second_moment
+    assert covariance_of(topics.odom[-1]) == pytest.approx(expected, rel=1e-9, abs=1e-16)
 
 
 def test_the_transform_repeats_the_odometry_where_tf2_ros_is_installed(lockstep, add, capfd):
@@ -215,54 +192,47 @@ def test_the_transform_repeats_the_odometry_where_tf2_ros_is_installed(lockstep,
     lockstep.run_for(0.1)
     words = 'tf2_ros is not installed: no transform is published'
     assert capfd.readouterr().err.count(words) == (0 if installed else 1)
-    assert len(topics.odom) == 6
-    assert len(received) == (6 if installed else 0)
-    frames = 'odom', 'base_link'
-    computed = [transform_of(value_of(ODOMETRY, one), *frames) for one in topics.odom]
-    transforms = [one.transforms[0] for one in received] or computed
-    for transform, odometry in zip(transforms, topics.odom, strict=True):
+    assert len(received) == (len(topics.odom) if installed else 0)
+    odometry = topics.odom[-1]
+    computed = transform_of(value_of(ODOMETRY, odometry), 'odom', 'base_link')
+    for transform in (computed, *(one.transforms[0] for one in received[-1:])):
         assert transform.header == odometry.header
         assert transform.child_frame_id == odometry.child_frame_id
         moved, position = transform.transform.translation, odometry.pose.pose.position
-        assert (moved.x, moved.y, moved.z) == (position.x, position.y, position.z)
+        assert (moved.x, moved.y) == (position.x, position.y)
         rotation, orientation = transform.transform.rotation, odometry.pose.pose.orientation
         assert (rotation.z, rotation.w) == pytest.approx((orientation.z, orientation.w), rel=1e-14)
-        assert (rotation.x, rotation.y) == (orientation.x, orientation.y)
-
-
-# --- Limits
-
-LIMITS = {
-    'forward': ({'linear__x__max_velocity': 0.25}, {'min_v': -0.25, 'max_v': 0.25}),
-    'reverse': ({'linear__x__min_velocity': -0.1}, {'min_v': -0.1}),
-    'no_reverse': (
-        {'linear__x__max_velocity': 0.5, 'linear__x__min_velocity': 0.0},
-        {'max_v': 0.5, 'min_v': 0.0},
-    ),
-    # The quotient of a speed and it overflows.
-    'too_small': ({'linear__x__max_velocity': 5e-324}, {'min_v': 0.0, 'max_v': 0.0}),
-    'turning': ({'angular__z__max_velocity': 1.0}, {'min_omega': -1.0, 'max_omega': 1.0}),
-    'clockwise': ({'angular__z__min_velocity': -0.5}, {'min_omega': -0.5}),
-    'wheels': ({'max_wheel_velocity': 9.0}, {'max_wheel_speed': 9.0}),
-}
-
-
-def test_limits_keep_the_curvature(lockstep, add):
-    applied = {name: lockstep.listen(TwistStamped, f'{name}/cmd_vel_out') for name in LIMITS}
-    for name, (given, _) in LIMITS.items():
-        add(VirtualRobot, name, **given)
-    for command in ((1.0, 3.0), (-1.0, 3.0), (-1.0, -3.0)):
-        for name, (_, limits) in LIMITS.items():
-            lockstep.publish(f'{name}/cmd_vel', twist(*command))
-            expected = saturate(*command, VelocityLimits(**limits), 0.033, 0.16)
-            assert twists(applied[name])[-1] == expected
 
 
 # --- Changes
 
 
+def test_limits_keep_the_curvature(lockstep, driving):
+    values = {'linear__x__max_velocity': 0.5, 'linear__x__min_velocity': 0.0, 'max_wheel_velocity': 9.0}
+    limits = VelocityLimits(max_v=0.5, min_v=0.0, max_wheel_speed=9.0)
+    assert change(driving.robot, **values).successful
+    for command in ((1.0, 3.0), (-1.0, 3.0), (0.1, 3.0)):
+        lockstep.publish('cmd_vel', twist(*command))
+        assert twists(driving.applied)[-1] == saturate(*command, limits, 0.033, 0.16)
+
+
+def test_wheel_speeds_stay_when_the_wheels_change(lockstep, add):
+    topics = Topics(lockstep)
+    robot = add(VirtualRobot, command_interface='wheels')
+    lockstep.publish('joint_command', joint_command(5.0, 10.0))
+    lockstep.run_for(0.2)
+    assert change(robot, wheel_radius=0.066).successful
+    lockstep.run_for(0.5)
+    first, second, zero = twists(topics.applied)
+    assert second == pytest.approx((2.0 * first[0], 2.0 * first[1]), rel=1e-15)
+    assert zero == (0.0, 0.0)
+    # The timeout counts from the command.
+    assert instants(topics.applied) == [SECOND, SECOND + SECOND // 5, SECOND + SECOND // 2]
+    assert list(topics.states[-1].position) == pytest.approx([2.5, 5.0], rel=1e-14)
+
+
 @pytest.mark.parametrize('rate', [0.5, 1000.0])
-def test_rate_changes_at_once(lockstep, driving, rate):
+def test_the_rate_changes_at_once(lockstep, driving, rate):
     lockstep.run_for(0.013)
     changed, period = lockstep.now, round(SECOND / rate)
     assert change(driving.robot, publish_rate=rate).successful
@@ -273,15 +243,6 @@ def test_rate_changes_at_once(lockstep, driving, rate):
     expected = range(first, lockstep.now + 1, period)
     assert instants(driving.odom) == list(expected)
     assert len(expected) in (5, 6)
-
-
-def test_rate_that_keeps_changing_starves_nobody(lockstep, driving):
-    driving.odom.clear()
-    for _ in range(20):
-        for rate in (21.0, 20.0):
-            change(driving.robot, publish_rate=rate)
-            lockstep.run_for(0.01)
-    assert len(driving.odom) >= 8
 
 
 def test_initial_pose_counts_from_the_next_reset_on_and_names_from_the_next_message(lockstep, driving):
@@ -297,16 +258,3 @@ def test_initial_pose_counts_from_the_next_reset_on_and_names_from_the_next_mess
     expected = pose_message([3.0, 4.0, 5.0 - math.tau])
     assert driving.starts[-1].pose.pose == expected
     assert comes_after(lockstep, driving.odom, 0.02).pose.pose == expected
-
-
-def test_uncertainty_grows_with_the_variance_of_the_wheels(lockstep, add):
-    topics, variance = Topics(lockstep), 1e-5
-    robot = add(VirtualRobot, wheel_travel_variance=0.0)
-    lockstep.publish('cmd_vel', twist(1.0, 0.0))
-    lockstep.run_for(0.2)
-    assert not np.any(covariance_of(topics.odom[-1]))
-    assert change(robot, wheel_travel_variance=variance).successful
-    lockstep.run_for(0.2)
-    arc = ((1.0, 0.0), 0.2, 0.16, variance)
-    expected = propagate_moments(gaussian(np.zeros((3, 3))), np.zeros(3), *arc).second_moment
-    assert covariance_of(topics.odom[-1]) == pytest.approx(expected, rel=1e-9, abs=1e-16)
