@@ -1,4 +1,4 @@
-"""Nodes as processes: ended by signals, killed, sent hostile messages, as `benchmark/soak.py` does."""
+"""Nodes as processes: ended by signals, killed, flooded, and sent hostile messages."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from contextlib import suppress
 
 import pytest
 from action_msgs.msg import GoalStatus
+from fork_server import forked
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Goals, Odometry
 from rclpy.serialization import serialize_message
+from std_srvs.srv import Trigger
 from support.damaged_messages import damaged
 from support.processes import Drive
-from support.ros_messages import goal, goals, odometry
+from support.ros_messages import at_rest, goal, goals, odometry
 
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
 
@@ -83,3 +85,37 @@ def test_hostile_messages_neither_end_a_controller_nor_reach_its_commands(world)
     assert len(lines) < 60
     assert all(map(str.isprintable, lines))
     assert 'Traceback' not in controller.stderr
+
+
+FLOOD = """
+import rclpy
+from geometry_msgs.msg import Twist
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+
+rclpy.init()
+publisher = Node('flood', start_parameter_services=False).create_publisher(Twist, 'cmd_vel', 10)
+twist = Twist()
+twist.linear.x = 0.2
+data = serialize_message(twist)
+while True:
+    publisher.publish(data)
+"""
+
+
+def test_a_flooded_robot_answers_and_stops_when_the_flood_ends(world):
+    robot = world.start('virtual_robot', '--ros-args', '-p', 'cmd_vel_timeout:=0.3')
+    odometry = world.harness.listen(Odometry, 'odom')
+    world.harness.until(lambda: odometry, 'the robot is heard')
+    # Two processes, so that there are more messages than can be handled also on a busy machine.
+    floods = [forked.Popen(FLOOD) for _ in range(2)]
+    try:
+        robot.until_says('arrive faster than they are handled')
+        assert world.harness.call(Trigger, 'reset_odometry').success
+        odometry.clear()
+        world.harness.until(lambda: odometry and not at_rest(odometry[-1]), 'the robot moves')
+    finally:
+        for flood in floods:
+            flood.kill()
+            flood.wait()
+    world.harness.until(lambda: at_rest(odometry[-1]), 'the robot stops')
