@@ -1,4 +1,4 @@
-"""All three nodes together, in lockstep: the whole Jacobian chain, several robots, and disturbances."""
+"""All three nodes together, in lockstep: the whole Jacobian chain, several robots, and lost nodes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from geometry_msgs.msg import Twist
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import (
     ACCEPTED,
-    CANCELED,
     EXECUTING,
     QUICK,
     SUCCEEDED,
@@ -30,8 +29,7 @@ def test_golden_case_of_document_a_through_the_topics(lockstep):
     lockstep.step()
     (command,) = twists(topics.commands)
     assert (round(command[0], 3), round(command[1], 3)) == (0.500, 2.356)
-    left, right = topics.states[-1].velocity
-    assert (left, right) == (0.0, 0.0)
+    assert list(topics.states[-1].velocity) == [0.0, 0.0]
     lockstep.step()
     left, right = topics.states[-1].velocity
     assert (round(right, 3), round(left, 3)) == (20.864, 9.440)
@@ -53,32 +51,6 @@ def test_robot_arrives_and_stands(lockstep):
     assert all(one.pose == topics.odom[there].pose for one in topics.odom[there:])
     assert all(map(at_rest, topics.odom[there + 1 :]))
     assert len(topics.odom) > there + 3
-    # The axle's centre goes as far as the mean wheel rolls forth and back: hardly less than straight.
-    velocities = [sum(one.velocity) / 2.0 * 0.033 / 50.0 for one in topics.states]
-    assert sum(map(abs, velocities)) >= math.dist(start[:2], target) - 0.02
-
-
-def test_new_goal_takes_over_without_a_stop_and_cancel_stops_at_once(lockstep, team):
-    lockstep.publish('goal_pose', goal(2.0, 0.0))
-    lockstep.run_for(0.2)
-    lockstep.publish('goal_pose', goal(0.0, 0.5))
-    arrives(lockstep, team)
-    assert team.statuses == [ACCEPTED, EXECUTING, CANCELED, ACCEPTED, EXECUTING, SUCCEEDED]
-    assert pose_of(team.odom[-1])[:2] == pytest.approx((0.0, 0.5), abs=0.02)
-    assert team.commands.count(Twist()) == 1
-    lockstep.publish('goal_pose', goal(2.0, 1.0))
-    lockstep.run_for(0.2)
-    assert lockstep.call(Trigger, 'cancel_goal').success
-    assert instants(team.applied)[-1] == lockstep.now
-    lockstep.run_for(0.02)
-    here = team.odom[-1].pose
-    assert at_rest(team.odom[-1])
-    lockstep.run_for(0.5)
-    assert team.odom[-1].pose == here
-    assert team.statuses[-1] == CANCELED
-
-
-# --- Several
 
 
 def driven(names, targets):
@@ -103,19 +75,17 @@ def test_robots_in_company_drive_as_each_drives_alone_to_the_last_bit():
         assert driven([name], [target]) == [published]
 
 
-# --- When something comes in between
-
-
-def test_a_robot_that_is_placed_or_reset_is_driven_on(lockstep, team):
+@pytest.mark.lockstep(start=100.0)
+def test_a_robot_that_is_placed_or_reset_or_whose_time_jumps_is_driven_on(lockstep, team):
     lockstep.publish('goal_pose', goal(1.0, 1.0))
     lockstep.run_for(0.2)
     lockstep.publish('initialpose', placement(3.0, 1.5, 1.0))
-    team.odom.clear()
-    lockstep.run_for(0.2)
-    assert pose_of(team.odom[0])[:2] == pytest.approx((3.0, 1.5), abs=0.1)
+    lockstep.run_for(0.1)
     assert lockstep.call(Trigger, 'reset_odometry').success
+    lockstep.run_for(0.1)
+    lockstep.jump(-90.0)
     arrives(lockstep, team)
-    assert len(team.starts) == 3
+    assert len(team.starts) == 4
     assert team.statuses == [ACCEPTED, EXECUTING, SUCCEEDED]
     assert pose_of(team.odom[-1])[:2] == pytest.approx((1.0, 1.0), abs=0.02)
 
@@ -132,21 +102,8 @@ def test_when_a_node_is_removed_the_others_stop_within_the_timeout(lockstep, tea
         assert team.commands[-1] == Twist()
         return
     # The robot sees to that, and the bridge that is left, at the same time.
-    driven = zip(instants(team.applied), twists(team.applied), strict=True)
-    assert {at for at, command in driven if command == (0.0, 0.0)} == {last + 500_000_000}
+    applied = zip(instants(team.applied), twists(team.applied), strict=True)
+    assert {at for at, command in applied if command == (0.0, 0.0)} == {last + 500_000_000}
     assert at_rest(team.odom[-1])
     # The controller without its bridge goes on to command.
     assert removed == 'controller' or team.commands[-1] != Twist()
-
-
-@pytest.mark.lockstep(start=100.0)
-@pytest.mark.parametrize('seconds', [-90.0, 0.05])
-def test_time_jumps_while_driving_and_the_robot_arrives(lockstep, team, seconds):
-    lockstep.publish('goal_pose', goal(1.0, 1.0))
-    lockstep.run_for(0.3)
-    lockstep.jump(seconds)
-    lockstep.run_for(0.05)
-    assert len(team.starts) == (2 if seconds < 0.0 else 1)
-    arrives(lockstep, team)
-    assert team.statuses == [ACCEPTED, EXECUTING, SUCCEEDED]
-    assert pose_of(team.odom[-1])[:2] == pytest.approx((1.0, 1.0), abs=0.02)
