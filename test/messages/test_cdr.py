@@ -156,11 +156,7 @@ def test_any_fields_are_read_as_rclpy_reads_them(message_class, data):
         assert outcome(read, serialized) == outcome(read, serialized) == expected
 
 
-LENGTHS = [
-    struct.pack('<I', one) for one in (0, 1, 2, 3, 5, 8, 255, 1 << 16, (1 << 31) - 1, (1 << 32) - 1)
-]
-
-
+LENGTHS = [struct.pack('<I', one) for one in (0, 1, 2, 5, 255, 1 << 16, (1 << 31) - 1, (1 << 32) - 1)]
 NESTED = Float64MultiArray, ParameterEvent
 """Types with sequences in nested structures: rclpy reads too long ones as empty."""
 
@@ -192,25 +188,16 @@ def test_damaged_or_random_bytes_are_refused_or_read_as_by_rclpy(message_class, 
         assert ours == theirs or (ours is None and message_class in NESTED)
 
 
-@pytest.mark.parametrize(
-    'message',
-    [
-        Goals(header=Header(frame_id='odom'), goals=[PoseStamped()]),
-        JointState(name=['left', 'right'], velocity=[1.0, 2.0]),
-        PoseWithCovarianceStamped(),
-        ParameterEvent(node='a', new_parameters=[Parameter(name='b')]),
-    ],
-    ids=lambda message: type(message).__name__,
-)
-def test_bytes_cut_off_anywhere_are_refused_as_by_rclpy(message):
-    fields = readable(structure(type(message)))
-    read = reader(type(message), fields)
-    serialized = serialize_message(message)
-    assert outcome(read, serialized) is not None
-    assert outcome(read, b'') is None
-    for size in range(len(serialized)):
-        data = serialized[:size]
-        assert outcome(read, data) == rclpy_outcome(type(message), fields, data), size
+def test_bytes_cut_off_anywhere_are_refused_as_by_rclpy():
+    joints = JointState(name=['left', 'right'], velocity=[1.0, 2.0])
+    for message in (joints, ParameterEvent(node='a', new_parameters=[Parameter(name='b')])):
+        fields = readable(structure(type(message)))
+        read, serialized = reader(type(message), fields), serialize_message(message)
+        assert outcome(read, serialized) is not None
+        assert outcome(read, b'') is None
+        for size in range(len(serialized)):
+            data = serialized[:size]
+            assert outcome(read, data) == rclpy_outcome(type(message), fields, data), size
 
 
 def test_a_sequence_in_a_nested_structure_with_more_elements_than_bytes_is_refused():
@@ -220,12 +207,9 @@ def test_a_sequence_in_a_nested_structure_with_more_elements_than_bytes_is_refus
     fields = ['polygon.points[].x']
     read = reader(PolygonStamped, fields)
     assert read(serialized) == ((1.0,) * 5,)
-    first = len(serialized) - 5 * 12
-    # Less than one byte for each point is left, then one or more.
-    for size, theirs in ((first, ((),)), (first + 4, ((),)), (first + 5, None), (first + 59, None)):
-        damaged = serialized[:size]
-        assert outcome(read, damaged) is None
-        assert rclpy_outcome(PolygonStamped, fields, damaged) == theirs
+    damaged = serialized[: len(serialized) - 5 * 12]
+    assert outcome(read, damaged) is None
+    assert rclpy_outcome(PolygonStamped, fields, damaged) == ((),)
 
 
 def test_unusual_strings_are_read_as_rclpy_reads_them():
@@ -252,12 +236,6 @@ def test_other_encapsulations_are_left_to_rclpy():
                 Reader(Header, fields)(data)
 
 
-def test_sequences_of_many_strings_are_read_as_others():
-    names = [str(one) for one in range(3000)]
-    data = serialize_message(JointState(name=names, velocity=[0.5] * 3000))
-    assert Reader(JointState, ['name', 'velocity'])(data) == (tuple(names), (0.5,) * 3000)
-
-
 def test_a_huge_length_takes_no_memory():
     data = b'\0\1\0\0' + bytes(8) + b'\1\0\0\0\0\0\0\0'
     read = Reader(JointState, ['name', 'position', 'velocity'])
@@ -273,7 +251,7 @@ def test_a_huge_length_takes_no_memory():
 
 def test_messages_of_many_sizes_are_read_one_after_the_other_in_little_memory():
     read = Reader(JointState, ['name', 'velocity'])
-    for count in (*range(40), 5000, 3):
+    for count in (*range(20), 5000, 3):
         message = JointState(name=[str(one) for one in range(count)], velocity=[0.5] * count)
         assert read(serialize_message(message)) == (tuple(message.name), tuple(message.velocity))
     assert len(read._layouts) <= 16
@@ -333,15 +311,6 @@ def test_numbers_are_written_as_rclpy_writes_them(message_class, data):
         assert len(ours) <= len(theirs)
         with pytest.raises(RuntimeError):
             deserialize_message(ours[:-1], message_class)
-
-
-def test_messages_without_padding_are_written_byte_for_byte():
-    twist, clock = Twist(), Clock()
-    twist.linear.x, twist.angular.z = -0.25, np.float64(1e-310)
-    clock.clock.sec, clock.clock.nanosec = 5, 999_999_999
-    assert Writer(Twist(), ['linear.x', 'angular.z'])((-0.25, 1e-310)) == serialize_message(twist)
-    fields = ['clock.sec', 'clock.nanosec']
-    assert Writer(Clock(), fields)((5, 999_999_999)) == serialize_message(clock)
 
 
 def test_an_array_takes_a_number_for_each_element_and_each_message_has_its_own_bytes():

@@ -1,4 +1,4 @@
-"""The serialized messages that the nodes receive and publish."""
+"""The serialized messages that the nodes receive and publish, and the values that are refused."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import math
 import re
 import struct
 
+import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nav_msgs.msg import Odometry
@@ -18,7 +19,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from support.lockstep_nodes import make
-from support.ros_messages import goal, goals, odometry, path, pose_of, value_of
+from support.ros_messages import goal, goals, odometry, path, pose_of, twist_stamped, value_of
 
 from diffdrive_jacobian.bags.message_definitions import (
     is_known,
@@ -26,8 +27,6 @@ from diffdrive_jacobian.bags.message_definitions import (
     message_class,
 )
 from diffdrive_jacobian.bags.run import Run
-from diffdrive_jacobian.control.controller import Controller
-from diffdrive_jacobian.messages import codecs
 from diffdrive_jacobian.messages.codecs import (
     GOALS,
     JOINT_STATE,
@@ -47,35 +46,28 @@ from diffdrive_jacobian.messages.codecs import (
     WheelArray,
     Wheels,
 )
-from diffdrive_jacobian.messages.conversion import MessageError, from_twist
+from diffdrive_jacobian.messages.conversion import (
+    MessageError,
+    from_covariance,
+    from_joints,
+    from_pose,
+    from_twist,
+)
 from diffdrive_jacobian.messages.topics import TABLES, TOPICS
-from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 
-INPUTS = [
-    (VirtualRobot, {}, Twist, 'cmd_vel'),
-    (VirtualRobot, {'command_interface': 'wheels'}, JointState, 'joint_command'),
-    (VirtualRobot, {}, PoseWithCovarianceStamped, 'initialpose'),
-    (GoToGoal, {}, Odometry, 'odom'),
-    (GoToGoal, {}, PoseStamped, 'goal_pose'),
-    (WheelBridge, {'enable_stamped_cmd_vel': True}, TwistStamped, 'cmd_vel'),
-]
+# --- Received by a node
 
 
-@pytest.mark.parametrize(('node_class', 'parameters', 'message_class', 'topic'), INPUTS)
-def test_bytes_that_are_no_message_are_dropped_and_named(
-    lockstep, capfd, node_class, parameters, message_class, topic
-):
-    lockstep.add(make(node_class, **parameters))
-    publisher = lockstep.node.create_publisher(message_class, topic, 10)
-    valid = serialize_message(message_class())
+def test_bytes_that_are_no_message_are_dropped_and_named(lockstep, capfd):
+    lockstep.add(make(VirtualRobot))
+    publisher = lockstep.node.create_publisher(Twist, 'cmd_vel', 10)
+    valid = serialize_message(Twist())
     for data in (b'', valid[:-12], b'\0\1\0\0' + b'\xff' * 40, b'\1\2' + valid[2:]):
         publisher.publish(data)
         lockstep.settle()
     # The log is throttled, and the node goes on.
-    words = f'{topic} dropped: it is not a {message_class.__name__} message'
+    words = 'cmd_vel dropped: it is not a Twist message'
     assert capfd.readouterr().err.count(words) == 1
     lockstep.run_for(0.1)
 
@@ -89,28 +81,9 @@ def test_a_command_of_a_big_endian_machine_is_followed(lockstep):
     assert (applied[-1].twist.linear.x, applied[-1].twist.angular.z) == (0.5, -0.25)
 
 
-def test_the_controller_reads_frame_and_pose_of_an_odometry():
-    for message in (Odometry(), odometry(1.0, -2.0, 0.5, frame='Karte ä')):
-        stamp, frame, pose, twist = ODOMETRY_STATE.reader(Odometry)(serialize_message(message))
-        assert stamp == (message.header.stamp.sec, message.header.stamp.nanosec)
-        assert frame == message.header.frame_id
-        assert twist == value_of(ODOMETRY, message).twist
-        assert pose == value_of(ODOMETRY, message).pose == tuple(pose_of(message))
-
-
-@pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf, 1000.5])
-def test_odometry_with_a_twist_that_is_not_plausible_is_refused(bad):
-    """A robot with such a twist would never be slow enough to have arrived."""
-    for part in ('linear.x', 'angular.z'):
-        message = odometry(1.0, 0.0, 0.0)
-        vector, component = part.split('.')
-        setattr(getattr(message.twist.twist, vector), component, bad)
-        with pytest.raises(MessageError, match='twist must be within'):
-            value_of(ODOMETRY_STATE, message)
-
+# --- Written and read
 
 times = st.integers(0, 2**31 * 10**9 - 1)
-stamps = times.map(lambda time: divmod(time, 10**9))
 numbers = st.floats(-1e3, 1e3)
 pairs = st.tuples(numbers, numbers)
 # The heading is read from a quaternion.
@@ -155,20 +128,38 @@ def test_what_is_written_is_read_again(codec, template, values, data):
     assert codec.numbers(found) == pytest.approx(expected, rel=1e-14, abs=1e-14)
 
 
-def test_every_codec_is_of_a_type_that_bags_are_read_with():
+def test_every_topic_is_of_a_type_that_bags_are_read_with_and_of_a_series_of_runs():
     for topic in TOPICS.values():
         for codec in topic.codecs:
             codec.reader(known_structure(codec.type_name))
             codec.reader(message_class(codec.type_name))
             assert is_known(codec.type_name)
+    assert {table.series for table in TABLES} <= {field.name for field in dataclasses.fields(Run)}
 
 
-def test_every_codec_that_writes_and_every_table_of_a_run_is_tested():
-    known = {id(codec) for codec, _, _ in WRITTEN}
-    every = [one for one in vars(codecs).values() if isinstance(one, codecs.Codec)]
-    assert [one.type_name for one in every if one.written and id(one) not in known] == []
-    of_runs = {field.name for field in dataclasses.fields(Run)}
-    assert {table.series for table in TABLES} - of_runs == set(), 'a table of TOPICS has no field in Run'
+def test_the_controller_reads_frame_and_pose_of_an_odometry():
+    for message in (Odometry(), odometry(1.0, -2.0, 0.5, frame='Karte ä')):
+        stamp, frame, pose, twist = ODOMETRY_STATE.reader(Odometry)(serialize_message(message))
+        assert stamp == (message.header.stamp.sec, message.header.stamp.nanosec)
+        assert frame == message.header.frame_id
+        assert twist == value_of(ODOMETRY, message).twist
+        assert pose == value_of(ODOMETRY, message).pose == tuple(pose_of(message))
+
+
+@pytest.mark.parametrize('angles', [None, (0.5, -0.5)])
+def test_wheels_are_left_right_in_messages_and_right_left_in_the_library(angles):
+    names, time, speeds = ('left', 'right'), 1_500_000_000, (3.0, 2.0)
+    positions = [] if angles is None else [0.0, 0.0]
+    template = JointState(name=[*names], velocity=[0.0, 0.0], position=positions)
+    data = JOINT_STATE.writer(template)(Wheels.of(time, names, speeds, angles))
+    state = deserialize_message(data, JointState)
+    data = WHEEL_ARRAY.writer(Float64MultiArray(data=[0.0, 0.0]))(WheelArray.of(speeds))
+    array = deserialize_message(data, Float64MultiArray)
+    assert list(state.velocity) == list(array.data) == [2.0, 3.0]
+    assert list(state.position) == ([] if angles is None else [-0.5, 0.5])
+    assert (state.header.stamp.sec, state.header.stamp.nanosec) == (1, 500_000_000)
+    assert value_of(JOINT_STATE, state).speeds(names) == speeds
+    assert value_of(WHEEL_ARRAY, array).speeds(names) == speeds
 
 
 def test_values_of_parameters_are_those_of_rclpy():
@@ -182,42 +173,80 @@ def test_values_of_parameters_are_those_of_rclpy():
         value_of(PARAMETER_EVENT, event)
 
 
+# --- Values that are refused
+
+
 @pytest.mark.parametrize('extreme', [math.nan, math.inf, 1000.5, 1e3, -1e3])
 def test_a_twist_is_read_if_it_is_plausible(extreme):
     """Of the components that a differential drive cannot follow only that they are finite."""
     for place in range(6):
         values = [0.25] * 6
         values[place] = extreme
-        data = b'\0\1\0\0' + struct.pack('<6d', *values)
         if math.isfinite(extreme) and (abs(extreme) <= 1e3 or place not in (0, 5)):
-            assert TWIST.reader(Twist)(data) == Command((values[0], values[5]))
+            assert from_twist(*values) == (values[0], values[5])
         else:
             with pytest.raises(MessageError, match='twist must be'):
-                TWIST.reader(Twist)(data)
-
-
-def test_components_whose_sum_overflows_are_finite():
+                from_twist(*values)
+    # Their sum overflows.
     assert from_twist(0.5, 1e308, 1e308, 1e308, 1e308, -0.25) == (0.5, -0.25)
-    with pytest.raises(MessageError, match='twist must be within'):
-        from_twist(1e308, 1e308, 0.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
-    ('codec', 'message', 'least', 'most'),
+    ('read', 'values', 'words'),
     [
-        (GOALS, goals(*[goal(1, 0)] * 2001), 1, 2000),
-        (PATH, path(*[(1, 0)] * 10_001), 2, 10_000),
-        (GOALS, goals(), 1, 2000),
-        (PATH, path((1, 0)), 2, 10_000),
+        (from_pose, (-math.inf, 0, 0, 0, 0, 1), 'x -inf'),
+        (from_pose, (0, 1.000001e6, 0, 0, 0, 1), 'within 1e+06 m'),
+        (from_pose, (0, 0, 0, 0, 0, 0), 'quaternion of length 1 (0.9 to 1.1), got x 0, y 0, z 0, w 0'),
+        (from_pose, (0, 0, 0, 0, math.nan, 1), 'z nan'),
+        (from_pose, (0, 0, 0, 0, 0, 1.2), 'w 1.2'),
+        (from_joints, (('l', 'r'), (1,), ('l', 'r')), 'got 2 joints and 1 velocities'),
+        (
+            from_joints,
+            (('l', 'r', 'l'), (1, 2, 3), ('l', 'r')),
+            "each of ['l', 'r'] once, got ['l', 'r'",
+        ),
+        (from_joints, (('l', 'x'), (1, 2), ('l', 'r')), "got ['l', 'x']"),
+        (from_joints, (('l', 'r'), (1, math.nan), ('l', 'r')), 'finite, got left 1, right nan'),
+        (from_joints, (('l', 'r'), (-1.1e6, 1), ('l', 'r')), 'within 1e+06 rad/s, got left -1.1e+06'),
+        (from_covariance, ((-1, 0, 0, 0, 1, 0, 0, 0, 1),), 'positive semidefinite'),
+        (from_covariance, ((1, 0.5, 0, 0, 1, 0, 0, 0, 1),), 'symmetric'),
+        (from_covariance, ((1e13, 0, 0, 0, 1, 0, 0, 0, 1),), 'at most 1e+12'),
+        (from_covariance, ((1, 0, 0, 0, 1, 0, 0, 0, math.nan),), 'finite'),
     ],
-    ids=['goals', 'path', 'no goals', 'short path'],
 )
-def test_goals_must_be_neither_too_few_nor_too_many(codec, message, least, most):
-    message.header.stamp.sec = 7
-    poses = message.goals if codec is GOALS else message.poses
-    with pytest.raises(GoalError, match=f'contain {least} to {most} poses, got {len(poses)}') as caught:
-        value_of(codec, message)
-    assert caught.value.stamp == (7, 0)
+def test_poses_wheel_speeds_and_covariances_that_are_refused(read, values, words):
+    with pytest.raises(MessageError, match=re.escape(words)):
+        read(*values)
+
+
+def test_variances_that_rounding_made_negative_are_set_to_zero():
+    """They would grow with the distance, and end the robot later."""
+    direction = np.array([0.6, 0.0, 0.8])
+    exact = np.outer(direction, direction)
+    found = from_covariance(exact - 1e-12 * np.eye(3))
+    np.testing.assert_allclose(found, exact, atol=1e-11)
+    assert np.linalg.eigvalsh(found)[0] > -1e-15
+
+
+def test_a_negative_stamp_is_not_taken_for_none():
+    message = twist_stamped(1.0, 0.0, 0)
+    # Together they are zero, which would mean that the command has no stamp.
+    message.header.stamp.sec, message.header.stamp.nanosec = -1, 1_000_000_000
+    with pytest.raises(MessageError, match='its stamp must have sec of at least 0'):
+        value_of(TWIST_STAMPED, message)
+
+
+@pytest.mark.parametrize('bad', [math.nan, -math.inf, 1000.5])
+def test_odometry_with_a_twist_that_is_not_plausible_is_refused(bad):
+    """A robot with such a twist would never be slow enough to have arrived."""
+    for part, component in (('linear', 'x'), ('angular', 'z')):
+        message = odometry(1.0, 0.0, 0.0)
+        setattr(getattr(message.twist.twist, part), component, bad)
+        with pytest.raises(MessageError, match='twist must be within'):
+            value_of(ODOMETRY_STATE, message)
+
+
+# --- Goals and paths
 
 
 def test_a_path_is_read_with_its_frames_and_stamps():
@@ -225,60 +254,37 @@ def test_a_path_is_read_with_its_frames_and_stamps():
         PATH, path((0, 1), goal(2, 3, 0.5, 'odom'), frame='odom', stamp=4, times=[5.0, 6.5])
     )
     assert (route.stamp, route.frame) == ((4, 0), 'odom')
-    assert value_of(GOALS, goals(goal(2, 3, 0.5, 'map'), frame='odom')).frame == 'map'
     assert route.poses == ((0.0, 1.0, 0.0), (2.0, 3.0, pytest.approx(0.5)))
     assert route.times == (0.0, 1.5)
     assert value_of(PATH, path((0, 1), (2, 3), times=[5.0, 5.0])).times is None
-    for times, words in (([2, 1], '1.0* s after 2.0* s at pose 1'), ([0, 1, 1], 'must increase')):
-        with pytest.raises(GoalError, match=f'stamps of the poses .*{words}'):
-            value_of(PATH, path((0, 1), (2, 3), (4, 5), times=times))
+    assert value_of(GOALS, goals(goal(2, 3, 0.5, 'map'), frame='odom')).frame == 'map'
+    assert value_of(POSE, goal(2, 3, 0.5, 'map')).frame == 'map'
 
 
 @pytest.mark.parametrize(
     ('codec', 'message', 'words'),
     [
         (POSE, goal(1e7, 0), 'position must be finite and within 1e+06 m'),
+        (GOALS, goals(), 'goals must contain 1 to 2000 poses, got 0'),
+        (GOALS, goals(*[goal(1, 0)] * 2001), 'got 2001'),
         (GOALS, goals(goal(1, 0), goal(math.nan, 0)), 'position must be finite'),
-        (GOALS, goals(goal(1, 0, frame='a'), frame='b'), None),
         (GOALS, goals(goal(1, 0, frame='a'), goal(1, 0), frame='b'), "in one frame, got ['a', 'b']"),
+        (PATH, path((1, 0)), 'path must contain 2 to 10000 poses, got 1'),
+        (PATH, path(*[(1, 0)] * 10_001), 'got 10001'),
         (PATH, path((0, 1), goal(1, 1, frame='a'), frame='b'), "in one frame, got ['a', 'b']"),
+        (PATH, path((0, 1), (2, 3), times=[2, 1]), 'got 1.000000000 s after 2.000000000 s at pose 1'),
+        (PATH, path((0, 1), (2, 3), (4, 5), times=[0, 1, 1]), 'must increase'),
     ],
 )
 def test_invalid_goals_are_known_by_their_stamp(codec, message, words):
     message.header.stamp.sec, message.header.stamp.nanosec = -1, 7
-    if words is None:
-        route = value_of(codec, message)
-        with pytest.raises(MessageError, match='its stamp must have sec of at least 0'):
-            TOPICS['goals'].table.rows(route, ('left', 'right'))
-        return
     with pytest.raises(GoalError, match=re.escape(words)) as caught:
         value_of(codec, message)
     assert caught.value.stamp == (-1, 7)
 
 
-@pytest.mark.parametrize('angles', [None, (0.5, -0.5)])
-def test_wheels_are_left_right_in_messages_and_right_left_in_the_library(angles):
-    names, time, speeds = ('left', 'right'), 1_500_000_000, (3.0, 2.0)
-    template = JointState(name=[*names], velocity=[0.0, 0.0])
-    if angles is not None:
-        template.position = [0.0, 0.0]
-    data = JOINT_STATE.writer(template)(Wheels.of(time, names, speeds, angles))
-    state = deserialize_message(data, JointState)
-    data = WHEEL_ARRAY.writer(Float64MultiArray(data=[0.0, 0.0]))(WheelArray.of(speeds))
-    array = deserialize_message(data, Float64MultiArray)
-    assert list(state.velocity) == list(array.data) == [2.0, 3.0]
-    assert list(state.position) == ([] if angles is None else [-0.5, 0.5])
-    assert (state.header.stamp.sec, state.header.stamp.nanosec) == (1, 500_000_000)
-    assert (
-        value_of(JOINT_STATE, state).speeds(names)
-        == value_of(WHEEL_ARRAY, array).speeds(names)
-        == speeds
-    )
-
-
-def test_laws_of_other_packages_receive_arrays():
-    def law(pose, goal, kp, kv):
-        return (goal - pose[:2]).tolist()
-
-    bound = Controller(name='own', law=law).bind(GoToGoalParameters())
-    assert tuple(bound((1.0, 2.0, 0.5), (3.0, 4.5, 0.0))) == (2.0, 2.5)
+def test_the_stamp_of_goals_is_checked_where_a_bag_is_read():
+    message = goals(goal(1, 0))
+    message.header.stamp.sec = -1
+    with pytest.raises(MessageError, match='its stamp must have sec of at least 0'):
+        TOPICS['goals'].table.rows(value_of(GOALS, message), ('left', 'right'))
