@@ -23,7 +23,7 @@ from diffdrive_jacobian.simulation import closed_loops
 from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 
 MILLISECOND = 1_000_000
-SPIRAL, COAST, BACK = 'is not larger than kv', 'choose kp > 2 kv', 'may not back up'
+SPIRAL, WEAVES = 'is not larger than kv', 'the robot weaves about the path'
 NO_FORWARD, NO_TURN = 'the robot may not drive forward', 'the robot may turn in one direction only'
 
 
@@ -53,33 +53,24 @@ def test_gains_that_are_too_large_for_the_rate():
     assert len(rate_warnings(GoToGoalParameters(**offset, use_goal_heading=True), 10.0)) == 1
 
 
+BACKWARDS = {'controller': 'offset_point', 'linear_x_min_velocity': 0.0}
+SLOW = {'linear_x_max_acceleration': 0.05, 'kv': 1.0}
+
+
 @pytest.mark.parametrize(
-    ('unsuitable', 'suitable', 'words'),
+    ('warnings', 'unsuitable', 'suitable', 'words'),
     [
-        ({'kp': 0.5, 'kv': 0.5}, {'kp': 0.6}, SPIRAL),
-        ({'controller': 'pose', 'kp': 1.0, 'kv': 0.5}, {'kp': 1.1}, COAST),
-        (
-            {'controller': 'offset_point', 'linear_x_min_velocity': 0.0},
-            {'linear_x_min_velocity': -0.1},
-            BACK,
-        ),
-        (
-            {'linear_x_max_acceleration': 0.05, 'kv': 1.0, 'kp': 3.0},
-            {'stop_in_time': True},
-            'kv 1 lets the robot drive too fast to stop',
-        ),
+        (gain_warnings, {'kp': 0.5, 'kv': 0.5}, {'kp': 0.6}, SPIRAL),
+        (gain_warnings, {'controller': 'pose', 'kp': 1.0}, {'kp': 1.1}, 'choose kp > 2 kv'),
+        (gain_warnings, BACKWARDS, {'linear_x_min_velocity': -0.1}, 'may not back up'),
+        (gain_warnings, SLOW, {'stop_in_time': True}, 'kv 1 lets the robot drive too fast to stop'),
+        (path_warnings, {'path_controller': 'kanayama', 'k_theta': 1.0}, {'k_theta': 5.0}, WEAVES),
     ],
 )
-def test_gains_and_limits_that_do_not_suit_the_law_of_goals(unsuitable, suitable, words):
-    (warning,) = gain_warnings(GoToGoalParameters(**unsuitable))
+def test_gains_and_limits_that_do_not_suit_the_law(warnings, unsuitable, suitable, words):
+    (warning,) = warnings(GoToGoalParameters(**unsuitable))
     assert words in warning
-    assert gain_warnings(GoToGoalParameters(**{**unsuitable, **suitable})) == []
-
-
-def test_gains_of_the_law_of_paths():
-    assert path_warnings(GoToGoalParameters()) == []
-    (warning,) = path_warnings(GoToGoalParameters(path_controller='kanayama', k_theta=1.0))
-    assert 'the robot weaves about the path' in warning
+    assert warnings(GoToGoalParameters(**{**unsuitable, **suitable})) == []
 
 
 def test_the_advice_is_given_where_a_robot_overshoots():
@@ -144,12 +135,12 @@ def test_along_a_path_its_law_is_warned_about(lockstep, capfd):
     lockstep.add(make(GoToGoal, kp=0.5, kv=0.5, **weaving))
     lockstep.publish('path', path((0.0, 0.0), (1.0, 0.0)))
     said = capfd.readouterr().err
-    assert 'the robot weaves about the path' in said
+    assert WEAVES in said
     assert SPIRAL not in said
     lockstep.publish('goal_pose', goal(1.0, 0.0))
     said = capfd.readouterr().err
     assert SPIRAL in said
-    assert 'weaves' not in said
+    assert WEAVES not in said
 
 
 # --- The rate of the odometry

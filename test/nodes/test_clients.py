@@ -34,7 +34,7 @@ from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros.runner import Runner
 from diffdrive_jacobian.ros.service_client import LONGEST_STEP, PENDING, Liveness
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import send_goal as sending
+from diffdrive_jacobian.tools.send_goal import report
 
 
 def add_client(ros, goals, **kwargs):
@@ -47,18 +47,14 @@ def add_client(ros, goals, **kwargs):
 # --- Goals
 
 
-def test_goals_are_sent_with_the_first_odometry_unless_withdrawn(ros, capfd):
+def test_goals_are_sent_with_the_first_odometry_unless_withdrawn(ros):
     client = add_client(ros, [[1.0, 0.0, 0.0], [1.0, 1.0, 0.5]])
     received, talk = ros.listen(Goals, 'goals'), ros.talk(Odometry, 'odom')
     assert client.distance == math.inf
     client.send_on_odometry()
     client.withdraw()
-    bad = odometry(0.1, 0.0, 0.0)
-    bad.header.stamp.sec = -1
-    talk.publish(bad)
     talk.publish(odometry(0.5, 0.0, 0.0))
     ros.until(lambda: client.robot is not None, 'odometry is received')
-    assert 'odometry dropped: its stamp must have sec of at least 0' in capfd.readouterr().err
     assert not client.sent
     assert client.distance == 0.5
     client.index = 1
@@ -312,15 +308,11 @@ def test_a_goal_of_a_robot_that_does_not_move_is_reported():
     assert result.status is GoalState.CANCELED
 
 
-def test_the_report_does_not_claim_that_an_unknown_robot_was_stopped(capsys):
+def test_the_report_does_not_claim_that_an_unknown_robot_was_stopped():
     options = argparse.Namespace(timeout=7.0, wait=10.0, x=1.0, y=1.0)
     values = {'result': Result.TIMEOUT, 'topic': '/goal_pose', 'status': GoalState.CANCELED}
-    unknown = sending.report(GoalResult(**values, canceled=True), options, 'goal (1, 1)')
-    assert unknown[0] == 'not arrived within --timeout 7 s'
-    assert 'it is not known whether a robot drove' in unknown[1]
-    known = sending.report(GoalResult(**values, canceled=True, distance=1.0), options, 'goal (1, 1)')
-    assert known[1] == 'canceled: the robot was stopped'
-    several = GoalResult(result=Result.SEVERAL, topic='/goal_pose', reason='several answer')
-    assert sending.report(several, options, 'goal (1, 1)') == ['not sent: several answer']
-    sending.Progress('send_goal', 'goal (1, 1)').standing(5.0)
-    assert 'the robot has not moved for 5 s' in capsys.readouterr().out
+    for distance, words in ((None, 'it is not known whether a robot drove'), (1.0, 'robot was stopped')):
+        result = GoalResult(**values, canceled=True, distance=distance)
+        late, canceled = report(result, options, 'goal (1, 1)')
+        assert late.startswith('not arrived within --timeout 7 s')
+        assert words in canceled

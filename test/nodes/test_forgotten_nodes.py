@@ -14,7 +14,6 @@ from sensor_msgs.msg import JointState
 from support.lockstep_nodes import ACCEPTED, CANCELED, EXECUTING, SUCCEEDED, Controller, Topics
 from support.ros_messages import goal, goals, joint_command, placement, twist, twists
 
-from diffdrive_jacobian.faults import Duplicate
 from diffdrive_jacobian.nodes import other_drivers
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -161,16 +160,6 @@ def test_a_controller_of_the_same_name_is_perhaps_that_of_somebody_else(
     assert f'{name} drives the robot by /cmd_vel' in text
     for words in (f'another {name}', 'ROS_DOMAIN_ID of your own', 'DISCOVERY_RANGE=LOCALHOST'):
         assert (words in text) == same
-
-
-def test_own_commands_that_arrive_twice_are_own(lockstep, add, node):
-    add(VirtualRobot)
-    controller = add(GoToGoal)
-    node.create_publisher(Twist, 'cmd_vel', 10)
-    lockstep.inject(Duplicate('cmd_vel', start=1.5, duration=0.5))
-    lockstep.publish('goals', goals(goal(50.0, 0.0)))
-    lockstep.run_for(3.0)
-    assert controller.waypoint == 0
 
 
 @pytest.mark.parametrize('command', [Twist, TwistStamped])

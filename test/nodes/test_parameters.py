@@ -117,20 +117,16 @@ def test_quality_of_service_can_be_overridden(add):
 ROBOT, GOAL = VirtualRobotParameters, GoToGoalParameters
 BAD = [
     (ROBOT, {'wheel_radius': 0.0}, "'wheel_radius' must be in [0.001, 10], got 0.0"),
-    (ROBOT, {'wheel_radius': math.nan}, 'got nan'),
     (ROBOT, {'wheel_radius': '1'}, "'wheel_radius' must be a double (as 1.0), got '1'"),
     (ROBOT, {'publish_rate': 5000.0}, "'publish_rate' must be in [0.1, 1000], got 5000.0"),
     (ROBOT, {'enable_odom_tf': 1}, "'enable_odom_tf' must be a bool (true or false), got 1"),
     (ROBOT, {'linear_x_max_velocity': -0.1}, "'linear.x.max_velocity' must be in [0, 1000] or .nan"),
-    (ROBOT, {'linear_x_min_velocity': 0.5}, 'got 0.5'),
     (ROBOT, {'command_interface': 'legs'}, "must be one of 'twist', 'wheels', got 'legs'"),
     (ROBOT, {'base_frame_id': ''}, "'base_frame_id' must be not empty"),
     (ROBOT, {'base_frame_id': 'odom'}, 'must differ'),
     (ROBOT, {'left_wheel_name': 'right_wheel_joint'}, "must differ, both are 'right_wheel_joint'"),
     (ROBOT, {'wheel_lag': 1e-20}, "'wheel_lag' must be 0.0 or at least 1e-09, got 1e-20"),
-    (GOAL, {'wheel_lag': 5e-324}, "'wheel_lag'"),
     (GOAL, {'controller': 'Pose'}, "'controller' must be one of '"),
-    (GOAL, {'controller': ['pose']}, "'controller'"),
     (GOAL, {'controller': 'offset_point', 'offset': -0.0009}, 'rank 1'),
     (GOAL, {'offset': 101.0}, "'offset' must be in"),
     *((GOAL, {name: bad}, f"'{name}'") for name in ('kp', 'kv') for bad in (0.0, math.nan, 101.0)),
@@ -208,9 +204,8 @@ def test_the_last_value_counts_and_integers_are_taken_for_doubles(written):
 
 
 KEYS = (
-    *('virtual_robot', '/virtual_robot', '/**', '**', '/*', '*', '/**/virtual_robot'),
-    *('/*/virtual_robot', 'a/virtual_robot', '/a/virtual_robot', '/a/*', '/a/**'),
-    *('/a/b/virtual_robot', '/a/**/virtual_robot', '/other', '/virtual_robot2', '/b/virtual_robot'),
+    *('virtual_robot', '/**', '*', '/**/virtual_robot', '/*/virtual_robot', 'a/virtual_robot'),
+    *('/a/*', '/a/**', '/a/b/virtual_robot', '/a/**/virtual_robot', '/other', '/virtual_robot2'),
 )
 
 
@@ -224,16 +219,6 @@ def test_a_name_concerns_the_nodes_to_which_rclpy_gives_the_parameters(written):
                 given = 'given' in node._parameter_overrides
                 assert concerns(name, node.get_fully_qualified_name()) == given, (key, namespace)
                 node.destroy_node()
-
-
-def test_the_names_in_a_file_are_found(written):
-    for text, names in (
-        ('a:\n  b:\n    ros__parameters: {x: {y: 1}, z: [1, {q: 2}]}\n', ['/a/b']),
-        ('{a: {ros__parameters: {x: 1}}, /b: {ros__parameters: {}}}', ['/a']),
-        ('a: [1, 2]\nb: {c: 1}\n', []),
-        ('text', []),
-    ):
-        assert [name for name, _ in sections(written(text))] == names, text
 
 
 ALIASES = b'a: &p\n  ros__parameters: {x: 1}\nb: *p\n'

@@ -13,53 +13,44 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 
-KINDS = {
-    'virtual_robot': (VirtualRobot, 'cmd_vel_timeout', {}, TwistStamped, 'cmd_vel_out'),
-    'wheel_bridge': (WheelBridge, 'cmd_vel_timeout', {}, JointState, 'joint_command'),
-    'go_to_goal': (
-        *(GoToGoal, 'odom_timeout', {'enable_stamped_cmd_vel': True}),
-        *(TwistStamped, 'cmd_vel'),
-    ),
-}
-"""Class, parameter of the timeout, further parameters, and what the node sends."""
-
 
 class Driven:
     """A node that something must be sent to, and what it lets the robot do."""
 
-    def __init__(self, lockstep, add, name, timeout):
-        kind, self.parameter, others, message, topic = KINDS[name]
-        self.lockstep, self.name = lockstep, name
+    parameter = 'cmd_vel_timeout'
+
+    def __init__(self, lockstep, add, kind, timeout):
+        self.lockstep, self.kind, stamped = lockstep, kind, {}
+        if kind is GoToGoal:
+            self.parameter, stamped = 'odom_timeout', {'enable_stamped_cmd_vel': True}
+        message = JointState if kind is WheelBridge else TwistStamped
+        topic = {VirtualRobot: 'cmd_vel_out', WheelBridge: 'joint_command', GoToGoal: 'cmd_vel'}[kind]
         self.out = lockstep.listen(message, topic)
-        self.node = add(kind, **{self.parameter: timeout}, **others)
-        if name == 'go_to_goal':
+        self.node = add(kind, **{self.parameter: timeout}, **stamped)
+        if kind is GoToGoal:
             lockstep.publish('goal_pose', goal(1.0, 0.0))
 
     def drive(self):
         """Send what it waits for."""
-        if self.name == 'go_to_goal':
+        if self.kind is GoToGoal:
             self.lockstep.publish('odom', odometry(0.0, 0.0, 0.0))
         else:
             self.lockstep.publish('cmd_vel', twist(0.5, 0.0))
 
-    def change_timeout(self, timeout):
-        assert change(self.node, **{self.parameter: timeout}).successful
-
     @property
     def moves(self):
-        return _moves(self.out[-1])
+        return self._moves(self.out[-1])
 
     @property
     def stops(self):
         """The times of the zeros (ns)."""
-        return [time_of(one) for one in self.out if not _moves(one)]
+        return [time_of(one) for one in self.out if not self._moves(one)]
+
+    def _moves(self, message):
+        return any(message.velocity) if self.kind is WheelBridge else message.twist.linear.x != 0.0
 
 
-def _moves(message):
-    return bool(any(message.velocity) if isinstance(message, JointState) else message.twist.linear.x)
-
-
-@pytest.fixture(params=KINDS)
+@pytest.fixture(params=[VirtualRobot, WheelBridge, GoToGoal])
 def create(lockstep, add, request):
     """Create one of the nodes, with a timeout (s)."""
     return lambda timeout=0.5: Driven(lockstep, add, request.param, timeout)
@@ -87,18 +78,18 @@ def test_a_new_timeout_counts_from_the_last_message_on(lockstep, create):
     last = lockstep.now
     for timeout in (2.0, 0.7):
         lockstep.run_for(0.3)
-        driven.change_timeout(timeout)
+        assert change(driven.node, **{driven.parameter: timeout}).successful
     lockstep.run_for(0.3)
     assert driven.stops == [last + 7 * SECOND // 10]
     # One that is over when it is set stops the robot.
     driven.drive()
     lockstep.run_for(0.3)
-    driven.change_timeout(0.1)
+    assert change(driven.node, **{driven.parameter: 0.1}).successful
     lockstep.run_for(0.03)
     assert len(driven.stops) == 2
     # Without one it drives on.
     driven.drive()
-    driven.change_timeout(0.0)
+    assert change(driven.node, **{driven.parameter: 0.0}).successful
     lockstep.run_for(5.0)
     assert driven.moves
 
