@@ -90,15 +90,6 @@ def test_stop_cancels_the_goal_once(lockstep, controller):
 # --- Parameters that change while it drives
 
 
-def test_tolerances_change_live(controller):
-    for tolerance in (1e-6, 100.0):
-        assert change(controller.node, xy_goal_tolerance=tolerance).successful
-        controller.send(goal(0.0, 0.0))
-        assert controller.at(-1.001 * tolerance, 0.0)[0] == pytest.approx(0.5 * 1.001 * tolerance)
-        assert controller.at(0.0, 0.999 * tolerance) == (0.0, 0.0)
-        assert controller.statuses[-1] == (0, SUCCEEDED)
-
-
 def test_after_a_switch_command_and_arrival_are_those_of_the_new_law(controller):
     controller.send(goal(1.0, 0.4))
     assert controller.at(0.0, 0.4) == (0.5, 0.0)

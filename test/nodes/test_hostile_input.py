@@ -101,19 +101,6 @@ def test_an_exception_of_our_own_callbacks_is_not_caught(add_complete, set_param
         set_parameters(of_type('kp', 10), double('kp', 2.5))
 
 
-def test_long_strings_are_refused_as_parameters(lockstep, add_complete):
-    robot = add_complete(VirtualRobot)
-    value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=10 * MEGABYTE)
-    request = SetParameters.Request(parameters=[ParameterMessage(name='odom_frame_id', value=value)])
-    (result,) = lockstep.call(SetParameters, 'virtual_robot/set_parameters', request).results
-    assert not result.successful
-    assert "'odom_frame_id' must be not empty and at most 256 characters, got 'fff" in result.reason
-    assert result.reason.endswith("...' (10000000 characters)")
-    assert len(result.reason) < 300
-    assert change(robot, odom_frame_id=256 * 'n').successful
-    assert not change(robot, odom_frame_id=257 * 'n').successful
-
-
 def test_a_malformed_type_hash_is_refused_and_not_logged_and_others_are_described(ros, capfd):
     node = ros.add(VirtualRobot)
     (service,) = [one for one in node.services if one.srv_type is GetTypeDescription]

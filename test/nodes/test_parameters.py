@@ -124,6 +124,7 @@ BAD = [
     (ROBOT, {'command_interface': 'legs'}, "must be one of 'twist', 'wheels', got 'legs'"),
     (ROBOT, {'base_frame_id': ''}, "'base_frame_id' must be not empty"),
     (ROBOT, {'base_frame_id': 'odom'}, 'must differ'),
+    (ROBOT, {'odom_frame_id': 257 * 'n'}, "n...' (257 characters)"),
     (ROBOT, {'left_wheel_name': 'right_wheel_joint'}, "must differ, both are 'right_wheel_joint'"),
     (ROBOT, {'wheel_lag': 1e-20}, "'wheel_lag' must be 0.0 or at least 1e-09, got 1e-20"),
     (GOAL, {'controller': 'Pose'}, "'controller' must be one of '"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -126,24 +125,18 @@ def test_each_pose_is_answered_by_the_law_that_was_chosen(name):
     assert pursuit.index == 1
 
 
-@pytest.mark.parametrize('name', LAWS)
-def test_where_the_heading_counts_the_robot_turns_in_place_at_the_end(name):
-    offset = 0.5 if name == 'offset_point' else 0.0
-    for use, heading in itertools.product((True, False), (-2.0, math.pi)):
-        steer = steering(controller=name, offset=0.5, yaw_goal_tolerance=0.1, use_goal_heading=use)
-        pursuit = Pursuit.of(Goal('', np.array([(0.0, 9.0, 1.0), (1.0, 0.0, heading)])))
-        pursuit, _ = steer.command(pursuit, axle(0.0, 9.0, math.pi / 2.0, offset), SECOND, RATE)
-        assert pursuit.index == 1
-        pursuit, found = steer.command(pursuit, axle(1.0, 0.0, 0.0, offset), SECOND, RATE)
-        # Pose always takes the heading.
-        if not use and name != 'pose':
+@pytest.mark.parametrize(('name', 'takes_heading'), [('go_to_goal', False), ('pose', True)])
+def test_where_the_heading_counts_the_robot_turns_in_place_at_the_end(name, takes_heading):
+    for use in (True, False):
+        steer = steering(controller=name, yaw_goal_tolerance=0.1, use_goal_heading=use)
+        pursuit = Pursuit.of(Goal('', np.array([(1.0, 0.0, -2.0)])))
+        pursuit, found = steer.command(pursuit, at(1.0, 0.0), SECOND, RATE)
+        if not use and not takes_heading:
             assert found is None
             continue
-        assert found == pytest.approx(turn_in_place(0.0, heading, 3.0))
-        # The position is not looked at any more, though the point swings off the goal.
-        pursuit, found = steer.command(pursuit, at(1.0, 0.1, heading - 0.2), SECOND, RATE)
-        assert found == pytest.approx((0.0, 0.6))
-        assert steer.command(pursuit, at(1.0, 0.1, heading - 0.09), SECOND, RATE)[1] is None
+        assert found == turn_in_place(0.0, -2.0, 3.0)
+        assert steer.command(pursuit, at(1.0, 0.1, -2.11), SECOND, RATE)[1] is not None
+        assert steer.command(pursuit, at(1.0, 0.1, -2.09), SECOND, RATE)[1] is None
 
 
 # --- Limits

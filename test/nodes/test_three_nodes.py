@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import pytest
 from geometry_msgs.msg import Twist
-from std_srvs.srv import Trigger
 from support.lockstep_nodes import (
     ACCEPTED,
     EXECUTING,
@@ -15,9 +13,8 @@ from support.lockstep_nodes import (
     Topics,
     add_team,
     arrives,
-    change,
 )
-from support.ros_messages import at_rest, goal, instants, placement, pose_of, twists
+from support.ros_messages import at_rest, goal, pose_of, twists
 
 from diffdrive_jacobian.testing import Lockstep
 
@@ -73,37 +70,3 @@ def test_robots_in_company_drive_as_each_drives_alone_to_the_last_bit():
     assert together[0][0][-1].pose != together[1][0][-1].pose
     for name, target, published in zip(names, targets, together, strict=True):
         assert driven([name], [target]) == [published]
-
-
-@pytest.mark.lockstep(start=100.0)
-def test_a_robot_that_is_placed_or_reset_or_whose_time_jumps_is_driven_on(lockstep, team):
-    lockstep.publish('goal_pose', goal(1.0, 1.0))
-    lockstep.run_for(0.2)
-    lockstep.publish('initialpose', placement(3.0, 1.5, 1.0))
-    lockstep.run_for(0.1)
-    assert lockstep.call(Trigger, 'reset_odometry').success
-    lockstep.run_for(0.1)
-    lockstep.jump(-90.0)
-    arrives(lockstep, team)
-    assert len(team.starts) == 4
-    assert team.statuses == [ACCEPTED, EXECUTING, SUCCEEDED]
-    assert pose_of(team.odom[-1])[:2] == pytest.approx((1.0, 1.0), abs=0.02)
-
-
-@pytest.mark.parametrize('removed', ['controller', 'bridge', 'robot'])
-def test_when_a_node_is_removed_the_others_stop_within_the_timeout(lockstep, team, removed):
-    assert change(team.controller, kp=3.0, kv=0.5).successful
-    lockstep.publish('goal_pose', goal(5.0, 0.0))
-    lockstep.run_for(0.3)
-    lockstep.remove(getattr(team, removed))
-    last = instants(team.applied)[-1]
-    lockstep.run_for(0.7)
-    if removed == 'robot':
-        assert team.commands[-1] == Twist()
-        return
-    # The robot sees to that, and the bridge that is left, at the same time.
-    applied = zip(instants(team.applied), twists(team.applied), strict=True)
-    assert {at for at, command in applied if command == (0.0, 0.0)} == {last + 500_000_000}
-    assert at_rest(team.odom[-1])
-    # The controller without its bridge goes on to command.
-    assert removed == 'controller' or team.commands[-1] != Twist()

@@ -10,7 +10,6 @@ from sensor_msgs.msg import JointState
 from support.lockstep_nodes import SECOND, Topics
 from support.ros_messages import (
     WHEELS,
-    at_rest,
     covariance_of,
     instants,
     joint_command,
@@ -111,19 +110,6 @@ def test_late_wheel_speeds_act_from_their_stamp_on(lockstep, robot_at):
 
 
 # --- Time
-
-
-@late
-@pytest.mark.parametrize('seconds', [0.25, 1e9])
-def test_jump_forward_drives_on_to_the_timeout_only(lockstep, driving, seconds):
-    lockstep.jump(seconds)
-    odometry = driving.odom[-1]
-    assert instants([odometry]) == [lockstep.now]
-    assert pose_of(odometry).tolist() == [min(seconds, 0.5), 0.0, 0.0]
-    assert at_rest(odometry) == (seconds >= 0.5)
-    lockstep.run_for(0.5)
-    assert pose_of(driving.odom[-1]).tolist() == [0.5, 0.0, 0.0]
-    assert instants(driving.applied) == [BEGIN, BEGIN + SECOND // 2]
 
 
 @late
