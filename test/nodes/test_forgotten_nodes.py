@@ -18,7 +18,6 @@ from diffdrive_jacobian.nodes import other_drivers
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros.graph_faults import LastingFault
 from diffdrive_jacobian.ros.node import FAULT_PATIENCE
 
 WHEELS = {'command_interface': 'wheels'}
@@ -68,13 +67,6 @@ def test_a_missing_or_second_node_is_reported_once(
     assert expected not in said(capfd)
     check(one, 3 * FAULT_PATIENCE)
     assert said(capfd).count(expected) == 1
-
-
-def test_a_fault_is_reported_once_after_it_has_lasted_and_again_after_it_was_gone():
-    fault = LastingFault(3)
-    present = ['a'] * 5 + [None] + ['a'] * 4 + ['b'] * 2 + ['a'] * 2 + ['b'] * 3
-    reports = [fault.check(one) for one in present]
-    assert [(index, one) for index, one in enumerate(reports) if one] == [(2, 'a'), (8, 'a'), (16, 'b')]
 
 
 def test_nothing_is_reported_of_a_complete_team(lockstep, team, capfd):

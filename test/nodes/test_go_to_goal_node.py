@@ -91,6 +91,7 @@ def test_stop_cancels_the_goal_once(lockstep, controller):
 
 
 def test_after_a_switch_command_and_arrival_are_those_of_the_new_law(controller):
+    assert change(controller.node, controller='pose').successful
     controller.send(goal(1.0, 0.4))
     assert controller.at(0.0, 0.4) == (0.5, 0.0)
     gains = {'kv': 2.0, 'offset': -0.4}

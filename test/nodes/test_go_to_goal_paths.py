@@ -116,21 +116,6 @@ def test_a_waypoint_that_was_missed_is_reported_and_driven_to(lockstep, capfd):
 # --- Commands on a path
 
 
-def test_a_user_has_a_path_law_of_his_own(lockstep):
-    def law(poses, references, gain):
-        x, y, *_ = np.moveaxis(references, -1, 0)
-        return gain * (x - poses[..., 0]), gain * (y - poses[..., 1])
-
-    mine = PathController(name='mine', law=law, gains=(ALL_PATH_CONTROLLERS.find('kanayama').gains[1],))
-    node = lockstep.add(GoToGoal(path_controller=mine))
-    assert node.get_parameter('path_controller').value == 'mine'
-    (gain,) = [node.get_parameter(one.name).value for one in mine.gains]
-    commands = lockstep.listen(Twist, 'cmd_vel')
-    lockstep.publish('path', STRAIGHT)
-    lockstep.publish('odom', odometry(0.0, 0.1, 0.0))
-    assert twists(commands) == [pytest.approx((0.0, -0.1 * gain))]
-
-
 def test_a_trajectory_waits_while_odometry_is_missing(lockstep):
     controller = Controller(lockstep, path_controller='kanayama')
     controller.send(path((0, 0), (10, 0), times=[0, 100]))
@@ -198,7 +183,7 @@ def test_the_same_path_again_goes_on_where_the_robot_is(lockstep, controller, ca
     assert controller.at(0.8, 0.0)[0] < 0.0
 
 
-def test_a_law_of_paths_with_a_state_is_reset_after_the_robot_has_stood(lockstep):
+def test_a_path_law_of_the_user_with_a_state_is_reset_after_the_robot_has_stood(lockstep):
     steps = []
 
     def law(pose, reference, *, state, dt):

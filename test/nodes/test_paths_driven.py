@@ -156,29 +156,34 @@ def test_a_trajectory_is_sent_with_stamps_where_the_robot_is(ros):
 # --- Timelines
 
 
-def paths_of(run):
-    """Return when which path counts: pairs of a time (s) and a number, -1 for none."""
-    one = timeline(run)
-    changes = [0, *(np.flatnonzero(np.diff(one.path)) + 1)]
-    return [(round(float(one.time[index]), 2), int(one.path[index])) for index in changes]
-
-
 ROUTE = path((0, 0), (5, 0))
-ACCEPTED = (11.0, '/goal_status', status(2))
+ONCE = [(0.0, -1), (1.0, 0), (2.0, -1)]
+STARTED = [(11.0, '/path', ROUTE), (11.0, '/goal_status', status(2))]
+REFUSED = [
+    (10.0, '/path', ROUTE),
+    (10.01, '/goal_status', status(2)),
+    (11.0, '/path', path((9, 9), stamp=7)),
+    (11.01, '/goal_status', status(6, seconds=7)),
+    (11.02, '/goal_status', status(2)),
+]
 
 
 @pytest.mark.parametrize(
-    'extra',
+    ('messages', 'expected'),
     [
-        [(12.0, '/goal_pose', goal(5, 0))],
-        *([ACCEPTED, (11.99, '/goal_status', status(end))] for end in (4, 5, 6)),
+        ([(11.0, '/path', ROUTE), (12.0, '/goal_pose', goal(5, 0))], ONCE),
+        ([*STARTED, (11.99, '/goal_status', status(4))], ONCE),
+        ([*STARTED, (11.99, '/goal_status', status(6))], ONCE),
+        (REFUSED, [(0.0, 0)]),
     ],
-    ids=['replaced', 'succeeded', 'canceled', 'aborted'],
+    ids=['replaced', 'succeeded', 'aborted', 'another is refused'],
 )
-def test_a_path_counts_until_it_has_ended_or_a_goal_replaces_it(tmp_path, extra):
-    run = run_of(tmp_path, [(11.0, '/path', ROUTE), *extra], **STRAIGHT)
-    assert paths_of(run) == [(0.0, -1), (1.0, 0), (2.0, -1)]
-    assert (timeline(run).goal >= 0).sum() == (100 if extra[0][1] == '/goal_pose' else 0)
+def test_a_path_counts_until_it_has_ended_or_a_goal_replaces_it(tmp_path, messages, expected):
+    """Each pair: a time (s), and the number of the path that counts from then on, -1 for none."""
+    one = timeline(run_of(tmp_path, messages, **STRAIGHT))
+    changes = [0, *(np.flatnonzero(np.diff(one.path)) + 1)]
+    assert [(round(float(one.time[at]), 2), int(one.path[at])) for at in changes] == expected
+    assert (one.goal >= 0).sum() == (100 if messages[-1][1] == '/goal_pose' else 0)
 
 
 def test_errors_along_a_trajectory_are_those_at_its_times(tmp_path):
@@ -187,14 +192,3 @@ def test_errors_along_a_trajectory_are_those_at_its_times(tmp_path):
     one = timeline(run_of(tmp_path, [(11.0, '/path', trajectory)], **STRAIGHT))
     along = one.along[(one.time > 1.1) & (one.time < 2.5)]
     assert along == pytest.approx(np.full(len(along), 0.1), abs=1e-6)
-
-
-def test_a_path_that_was_refused_or_is_none_never_counts(tmp_path):
-    extra = [
-        (10.0, '/path', ROUTE),
-        (10.01, '/goal_status', status(2)),
-        (11.0, '/path', path((9, 9), stamp=7)),
-        (11.01, '/goal_status', status(6, seconds=7)),
-        (11.02, '/goal_status', status(2)),
-    ]
-    assert paths_of(run_of(tmp_path, extra, **STRAIGHT)) == [(0.0, 0)]

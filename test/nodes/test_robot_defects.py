@@ -72,23 +72,6 @@ def test_the_true_pose_is_not_forgotten_when_a_drift_ends(bench):
     assert bench.robot.true_pose_tuple != bench.robot.pose_tuple
 
 
-def test_coarse_encoders_are_read_when_the_robot_reports(bench):
-    bench.defects.set_encoders(4)
-    begun = bench.reported().pose_tuple[0]
-    bench.now = 2 * SECOND
-    travelled = bench.reported().pose_tuple[0] - begun
-    assert travelled == pytest.approx(1.0, abs=2.0 * np.pi * bench.nominal.wheel_radius / 4)
-    # The pose is that of the last reading until the next one.
-    bench.now = 3 * SECOND
-    assert bench.defects.odometry_pose(bench.robot.at(bench.now))[0] == begun + travelled
-    bench.defects.set_encoders(None)
-    (place,) = bench.placed
-    assert place[0] > begun + travelled
-    assert bench.reported().pose_tuple == place
-    with pytest.raises(ValueError, match='per_revolution'):
-        bench.defects.set_encoders(0)
-
-
 def test_encoders_go_on_from_the_pose_of_those_before_or_where_the_odometry_is_placed(bench):
     bench.defects.set_encoders(4)
     bench.now += SECOND // 3

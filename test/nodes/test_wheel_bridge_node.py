@@ -181,7 +181,6 @@ def command(lockstep, times=4):
 @pytest.mark.parametrize(
     ('robot', 'bridge', 'said'),
     [
-        ({'wheel_radius': 0.05}, {'wheel_radius': 0.05}, None),
         (
             {'wheel_radius': 0.06},
             {'wheel_radius': 0.05},
