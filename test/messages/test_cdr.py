@@ -163,28 +163,23 @@ NESTED = Float64MultiArray, ParameterEvent
 @by_class
 @quickly
 @given(data=st.data())
-def test_damaged_or_random_bytes_are_refused_or_read_as_by_rclpy(message_class, data):
-    """Cut off, prolonged, overwritten (lengths too), or under another encapsulation."""
+def test_damaged_bytes_are_refused_or_read_as_by_rclpy(message_class, data):
+    """Overwritten, lengths too, prolonged, or under another encapsulation."""
     fields = readable(structure(message_class))
     read = reader(message_class, fields)
     serialized = serialize_message(data.draw(messages(message_class)))
     # A layout to be misled by.
     read(serialized)
     damaged = bytearray(serialized)
-    if data.draw(st.booleans()):
-        word = data.draw(st.one_of(st.binary(min_size=1, max_size=8), st.sampled_from(LENGTHS)))
-        place = data.draw(st.integers(4, len(damaged)) | st.integers(4, 40))
-        damaged[place : place + len(word)] = word
-    if data.draw(st.booleans()):
-        del damaged[data.draw(st.integers(0, len(damaged))) :]
-    if data.draw(st.booleans()):
-        damaged += data.draw(st.binary(max_size=9))
+    word = data.draw(st.binary(min_size=1, max_size=8) | st.sampled_from(LENGTHS))
+    place = data.draw(st.integers(4, len(damaged)) | st.integers(4, 40))
+    damaged[place : place + len(word)] = word
+    damaged += data.draw(st.binary(max_size=9))
     damaged[:2] = data.draw(st.just(damaged[:2]) | st.sampled_from(ENCAPSULATIONS))
-    random = b'\0\1\0\0' * data.draw(st.booleans()) + data.draw(st.binary(max_size=300))
-    for content in (bytes(damaged), random):
-        ours, theirs = outcome(read, content), rclpy_outcome(message_class, fields, content)
-        # The exception is that of the test of sequences in nested structures.
-        assert ours == theirs or (ours is None and message_class in NESTED)
+    ours = outcome(read, bytes(damaged))
+    theirs = rclpy_outcome(message_class, fields, bytes(damaged))
+    # The exception is that of the test of sequences in nested structures.
+    assert ours == theirs or (ours is None and message_class in NESTED)
 
 
 def test_bytes_cut_off_anywhere_are_refused_as_by_rclpy():
@@ -206,9 +201,11 @@ def test_a_sequence_in_a_nested_structure_with_more_elements_than_bytes_is_refus
     fields = ['polygon.points[].x']
     read = reader(PolygonStamped, fields)
     assert read(serialized) == ((1.0,) * 5,)
-    damaged = serialized[: len(serialized) - 5 * 12]
-    assert outcome(read, damaged) is None
-    assert rclpy_outcome(PolygonStamped, fields, damaged) == ((),)
+    first = len(serialized) - 5 * 12
+    # Less than one byte for each point is left.
+    for damaged in (serialized[:first], serialized[: first + 4]):
+        assert outcome(read, damaged) is None
+        assert rclpy_outcome(PolygonStamped, fields, damaged) == ((),)
 
 
 def test_unusual_strings_are_read_as_rclpy_reads_them():

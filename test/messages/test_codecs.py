@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-import struct
 
 import numpy as np
 import pytest
@@ -56,8 +55,6 @@ from diffdrive_jacobian.messages.conversion import (
 from diffdrive_jacobian.messages.topics import TABLES, TOPICS
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 
-# --- Received by a node
-
 
 def test_bytes_that_are_no_message_are_dropped_and_named(lockstep, capfd):
     lockstep.add(make(VirtualRobot))
@@ -70,15 +67,6 @@ def test_bytes_that_are_no_message_are_dropped_and_named(lockstep, capfd):
     words = 'cmd_vel dropped: it is not a Twist message'
     assert capfd.readouterr().err.count(words) == 1
     lockstep.run_for(0.1)
-
-
-def test_a_command_of_a_big_endian_machine_is_followed(lockstep):
-    applied = lockstep.listen(TwistStamped, 'cmd_vel_out')
-    lockstep.add(make(VirtualRobot))
-    data = b'\0\0\0\0' + struct.pack('>6d', 0.5, 0.0, 0.0, 0.0, 0.0, -0.25)
-    lockstep.node.create_publisher(Twist, 'cmd_vel', 10).publish(data)
-    lockstep.settle()
-    assert (applied[-1].twist.linear.x, applied[-1].twist.angular.z) == (0.5, -0.25)
 
 
 # --- Written and read
