@@ -156,18 +156,6 @@ def test_limits_keep_the_curvature(target):
     assert command(steering(**values), goal(target), at(0, 0)) == expected
 
 
-def test_a_robot_does_not_turn_by_more_than_a_half_turn_between_two_messages():
-    behind, steer = goal((-1, 1e-3)), steering(kp=100.0)
-    _, free = command(steer, behind, at(0, 0), math.inf)
-    assert free == pytest.approx(100.0 * math.pi, rel=1e-3)
-    for rate in (5.0, 30.0, 45.0):
-        _, omega = command(steer, behind, at(0, 0), rate)
-        assert abs(omega) <= math.pi * rate
-        # Whole turns less: the robot faces there at the next message.
-        turns = (free - omega) / (math.tau * rate)
-        assert turns == pytest.approx(round(turns))
-
-
 # --- Paths
 
 
