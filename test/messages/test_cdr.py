@@ -145,7 +145,8 @@ def reader(message_class, fields):
 @quickly
 @given(data=st.data())
 def test_any_fields_are_read_as_rclpy_reads_them(message_class, data):
-    fields = data.draw(st.lists(st.sampled_from(readable(structure(message_class))), unique=True))
+    every = readable(structure(message_class))
+    fields = data.draw(st.lists(st.sampled_from(every), unique=True))
     read = reader(message_class, fields)
     for message in data.draw(st.lists(messages(message_class), min_size=1, max_size=3)):
         serialized = serialize_message(message)
@@ -155,7 +156,7 @@ def test_any_fields_are_read_as_rclpy_reads_them(message_class, data):
         assert outcome(read, serialized) == outcome(read, serialized) == expected
 
 
-LENGTHS = [struct.pack('<I', one) for one in (0, 1, 2, 5, 255, 1 << 16, (1 << 31) - 1, (1 << 32) - 1)]
+LENGTHS = [struct.pack('<I', one) for one in (0, 1, 2, 5, 255, 1 << 16, (1 << 32) - 1)]
 NESTED = Float64MultiArray, ParameterEvent
 """Types with sequences in nested structures: rclpy reads too long ones as empty."""
 
@@ -222,7 +223,8 @@ def test_other_encapsulations_are_left_to_rclpy():
     fields = ['stamp.sec', 'stamp.nanosec', 'frame_id']
     for encapsulation in ENCAPSULATIONS[:-1]:
         big = not encapsulation[1] & 1
-        data = encapsulation + struct.pack('>2xiII5s' if big else '<2xiII5s', 12, 34, 5, b'odom\0')
+        fixed = struct.pack('>2xiII' if big else '<2xiII', 12, 34, 5)
+        data = encapsulation + fixed + b'odom\0'
         assert reader(Header, fields)(data) == (12, 34, 'odom')
         if encapsulation == b'\0\1':
             assert Reader(Header, fields)(data) == (12, 34, 'odom')
@@ -248,8 +250,9 @@ def test_a_huge_length_takes_no_memory():
 def test_messages_of_many_sizes_are_read_one_after_the_other_in_little_memory():
     read = Reader(JointState, ['name', 'velocity'])
     for count in (*range(20), 5000, 3):
-        message = JointState(name=[str(one) for one in range(count)], velocity=[0.5] * count)
-        assert read(serialize_message(message)) == (tuple(message.name), tuple(message.velocity))
+        names = [str(one) for one in range(count)]
+        data = serialize_message(JointState(name=names, velocity=[0.5] * count))
+        assert read(data) == (tuple(names), (0.5,) * count)
     assert len(read._layouts) <= 16
 
 
@@ -264,11 +267,13 @@ def test_the_start_of_a_message_can_be_read_without_the_rest():
 
 
 def test_a_field_that_cannot_be_read_is_an_error():
-    for wrong in ('pose', 'pose.pose.position.q', 'header.stamp.sec.x', 'len(q)', 'pose.covariance[]'):
+    for wrong in ('pose', 'pose.pose.q', 'header.stamp.sec.x', 'len(q)', 'pose.covariance[]'):
         with pytest.raises(ValueError, match='a field of Odometry must be'):
             Reader(Odometry, [wrong])
+    fields = ('number', Number('b')), ('text', Text(wide=True))
+    wide = Structure('a_msgs/One', fields)
     with pytest.raises(TypeError, match=r'a_msgs/One.text must not be a wide string'):
-        Reader(Structure('a_msgs/One', (('number', Number('b')), ('text', Text(wide=True)))), ['number'])
+        Reader(wide, ['number'])
 
 
 # --- Writing

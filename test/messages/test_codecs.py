@@ -152,10 +152,12 @@ def test_wheels_are_left_right_in_messages_and_right_left_in_the_library(angles)
 
 def test_values_of_parameters_are_those_of_rclpy():
     values = [None, True, -3, 0.5, 'ä', [b'\0', b'\xff'], [True, False], [1, -2], [0.5], ['', 'x']]
-    parameters = [Parameter(str(kind), Parameter.Type(kind), one) for kind, one in enumerate(values)]
-    event = ParameterEvent(node='/a', changed_parameters=[one.to_parameter_msg() for one in parameters])
-    found = PARAMETER_EVENT.reader(ParameterEvent)(serialize_message(event))
-    assert found == ('/a', {str(kind): one for kind, one in enumerate(values)}, 0)
+    event, expected = ParameterEvent(node='/a'), {}
+    for kind, value in enumerate(values):
+        parameter = Parameter(str(kind), Parameter.Type(kind), value)
+        event.changed_parameters.append(parameter.to_parameter_msg())
+        expected[str(kind)] = value
+    assert value_of(PARAMETER_EVENT, event) == ('/a', expected, 0)
     event.changed_parameters[0].value.type = 10
     with pytest.raises(MessageError, match='must be 0 to 9, got 10'):
         value_of(PARAMETER_EVENT, event)
@@ -179,23 +181,22 @@ def test_a_twist_is_read_if_it_is_plausible(extreme):
     assert from_twist(0.5, 1e308, 1e308, 1e308, 1e308, -0.25) == (0.5, -0.25)
 
 
+LEFT_RIGHT = ('l', 'r')
+
+
 @pytest.mark.parametrize(
     ('read', 'values', 'words'),
     [
         (from_pose, (-math.inf, 0, 0, 0, 0, 1), 'x -inf'),
         (from_pose, (0, 1.000001e6, 0, 0, 0, 1), 'within 1e+06 m'),
-        (from_pose, (0, 0, 0, 0, 0, 0), 'quaternion of length 1 (0.9 to 1.1), got x 0, y 0, z 0, w 0'),
+        (from_pose, (0, 0, 0, 0, 0, 0), 'quaternion of length 1 (0.9 to 1.1), got x 0'),
         (from_pose, (0, 0, 0, 0, math.nan, 1), 'z nan'),
         (from_pose, (0, 0, 0, 0, 0, 1.2), 'w 1.2'),
-        (from_joints, (('l', 'r'), (1,), ('l', 'r')), 'got 2 joints and 1 velocities'),
-        (
-            from_joints,
-            (('l', 'r', 'l'), (1, 2, 3), ('l', 'r')),
-            "each of ['l', 'r'] once, got ['l', 'r'",
-        ),
-        (from_joints, (('l', 'x'), (1, 2), ('l', 'r')), "got ['l', 'x']"),
-        (from_joints, (('l', 'r'), (1, math.nan), ('l', 'r')), 'finite, got left 1, right nan'),
-        (from_joints, (('l', 'r'), (-1.1e6, 1), ('l', 'r')), 'within 1e+06 rad/s, got left -1.1e+06'),
+        (from_joints, ('lr', (1,), LEFT_RIGHT), 'got 2 joints and 1 velocities'),
+        (from_joints, ('lrl', (1, 2, 3), LEFT_RIGHT), "each of ['l', 'r'] once"),
+        (from_joints, ('lx', (1, 2), LEFT_RIGHT), "got ['l', 'x']"),
+        (from_joints, ('lr', (1, math.nan), LEFT_RIGHT), 'finite, got left 1, right nan'),
+        (from_joints, ('lr', (-1.1e6, 1), LEFT_RIGHT), 'within 1e+06 rad/s, got left -1.1e+06'),
         (from_covariance, ((-1, 0, 0, 0, 1, 0, 0, 0, 1),), 'positive semidefinite'),
         (from_covariance, ((1, 0.5, 0, 0, 1, 0, 0, 0, 1),), 'symmetric'),
         (from_covariance, ((1e13, 0, 0, 0, 1, 0, 0, 0, 1),), 'at most 1e+12'),
@@ -238,9 +239,8 @@ def test_odometry_with_a_twist_that_is_not_plausible_is_refused(bad):
 
 
 def test_a_path_is_read_with_its_frames_and_stamps():
-    route = value_of(
-        PATH, path((0, 1), goal(2, 3, 0.5, 'odom'), frame='odom', stamp=4, times=[5.0, 6.5])
-    )
+    poses = (0, 1), goal(2, 3, 0.5, 'odom')
+    route = value_of(PATH, path(*poses, frame='odom', stamp=4, times=[5.0, 6.5]))
     assert (route.stamp, route.frame) == ((4, 0), 'odom')
     assert route.poses == ((0.0, 1.0, 0.0), (2.0, 3.0, pytest.approx(0.5)))
     assert route.times == (0.0, 1.5)
@@ -256,11 +256,11 @@ def test_a_path_is_read_with_its_frames_and_stamps():
         (GOALS, goals(), 'goals must contain 1 to 2000 poses, got 0'),
         (GOALS, goals(*[goal(1, 0)] * 2001), 'got 2001'),
         (GOALS, goals(goal(1, 0), goal(math.nan, 0)), 'position must be finite'),
-        (GOALS, goals(goal(1, 0, frame='a'), goal(1, 0), frame='b'), "in one frame, got ['a', 'b']"),
+        (GOALS, goals(goal(1, 0, frame='a'), goal(1, 0), frame='b'), "got ['a', 'b']"),
         (PATH, path((1, 0)), 'path must contain 2 to 10000 poses, got 1'),
         (PATH, path(*[(1, 0)] * 10_001), 'got 10001'),
         (PATH, path(*(goal(0, 0, frame=one) for one in 'edcba')), "'c', 'd', ... (5 in all)]"),
-        (PATH, path((0, 1), (2, 3), times=[2, 1]), 'got 1.000000000 s after 2.000000000 s at pose 1'),
+        (PATH, path((0, 1), (2, 3), times=[2, 1]), 'got 1.000000000 s after 2.0'),
         (PATH, path((0, 1), (2, 3), (4, 5), times=[0, 1, 1]), 'must increase'),
     ],
 )

@@ -65,11 +65,13 @@ class Controller:
 
 
 @pytest.mark.parametrize(
-    ('stamped', 'early'), [(True, False), (True, True), (False, False)], ids=['', 'early', 'unstamped']
+    ('stamped', 'early'),
+    [(True, False), (True, True), (False, False)],
+    ids=['', 'early', 'unstamped'],
 )
 def test_every_goal_has_the_fate_that_the_controller_gave_it(stamped, early):
     """Goals have stamps, all different, or none; their statuses may be received before them."""
-    for events in (events for length in range(1, 5) for events in product(EVENTS, repeat=length)):
+    for events in product(EVENTS, repeat=4):
         controller, follower, goals = Controller(), GoalFollower(), []
         for event in events:
             number = len(goals)
