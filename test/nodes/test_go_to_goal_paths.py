@@ -9,7 +9,6 @@ import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
-from std_srvs.srv import Trigger
 from support.lockstep_nodes import (
     ACCEPTED,
     CANCELED,
@@ -157,16 +156,6 @@ def test_slows_down_towards_the_end_and_drives_to_the_last_pose_as_to_a_goal(con
     assert controller.statuses == [(2, ACCEPTED), (2, EXECUTING), (2, SUCCEEDED)]
 
 
-def test_a_robot_far_from_the_start_does_not_skip_the_path(controller):
-    for place in [(1.0, 0.0), (0.7, 2.0), (3.0, 0.0)]:
-        controller.send(path(*((0.5 * index - 4.0, 0.0) for index in range(11)), stamp=2))
-        for _ in range(10):
-            controller.at(*place)
-        assert controller.node.waypoint <= 1
-        assert controller.statuses[-2:] == [(2, ACCEPTED), (2, EXECUTING)]
-        controller.send(goal(0, 0))
-
-
 def test_the_same_path_again_goes_on_where_the_robot_is(lockstep, controller, capfd):
     """As from a node that publishes its path every second, also while odometry is missing."""
     follow(controller, 0.0, 0.2, 0.4, 0.6)
@@ -204,17 +193,11 @@ def test_a_path_law_of_the_user_with_a_state_is_reset_after_the_robot_has_stood(
     assert steps == [(0.0, 0.0), (1.0, pytest.approx(0.1)), (0.0, 0.0)]
 
 
-def test_goal_and_path_replace_each_other_and_cancel_stops(lockstep, controller):
+def test_goal_and_path_replace_each_other(controller):
     controller.send(goal(1, 0, stamp=1))
-    controller.at(0, 0)
+    assert controller.at(0, 0) == (0.5, 0.0)
     controller.send(STRAIGHT)
     assert controller.at(0, 0) == (0.2, 0.0)
     controller.send(goal(1, 0, stamp=3))
     assert controller.at(0, 0) == (0.5, 0.0)
-    controller.send(path((0, 0), (1, 0), stamp=4))
-    controller.at(0, 0)
-    assert lockstep.call(Trigger, 'cancel_goal').success
-    assert twists(controller.commands)[-1] == (0.0, 0.0)
-    assert controller.sees(odometry(0, 0, 0)) == []
-    ends = [one for one in controller.statuses if one[1] == CANCELED]
-    assert ends == [(stamp, CANCELED) for stamp in (1, 2, 3, 4)]
+    assert controller.statuses[2:5] == [(1, CANCELED), (2, ACCEPTED), (2, EXECUTING)]

@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
-from support.lockstep_nodes import ABORTED, ACCEPTED, CANCELED, Controller, change
+from support.lockstep_nodes import Controller, change
 from support.ros_messages import goal, goals, odometry, placement, twist, value_of
 from type_description_interfaces.srv import GetTypeDescription
 
@@ -177,26 +177,20 @@ def assert_a_few(capfd, *words):
         assert ros_node.EVENT_BURST <= written.count(one) <= MOST_LINES, one
 
 
-def test_a_flood_of_goals_has_a_status_each_and_a_few_log_lines(controller, capfd):
-    for number in range(1, FLOOD):
-        controller.send(goal(1, 0, stamp=number))
-        controller.send(goal(9e9, 0, stamp=1000 + number))
-    assert_a_few(capfd, 'goal accepted: ', 'goal refused: ')
-    for number in range(1, FLOOD - 1):
-        statuses = [status for stamp, status in controller.statuses if stamp in (number, 1000 + number)]
-        assert statuses == [ACCEPTED, ABORTED, ACCEPTED, CANCELED]
-
-
 def test_events_of_the_nodes_are_logged_a_few_times(lockstep, add, controller, capfd):
     change(controller.node, odom_timeout=0.001)
-    for number in range(FLOOD):
+    for _ in range(FLOOD):
         controller.send(goal(1, 0))
+        controller.send(goal(9e9, 0))
         lockstep.run_for(0.002)
+        assert lockstep.call(Trigger, 'cancel_goal').success
+    assert_a_few(capfd, 'goal accepted: ', 'goal refused: ', 'goal canceled', 'the goal waits')
+    controller.send(goal(1, 0))
+    for number in range(FLOOD):
         controller.sees(odometry(0, 0, 0))
         lockstep.run_for(0.002)
         change(controller.node, kp=0.1 + 0.001 * number)
-        assert lockstep.call(Trigger, 'cancel_goal').success
-    assert_a_few(capfd, 'the goal waits', 'no valid odometry', 'is not larger than kv', 'goal canceled')
+    assert_a_few(capfd, 'no valid odometry', 'odometry is received again', 'is not larger than kv')
     lockstep.remove(controller.node)
     add(VirtualRobot)
     add(WheelBridge, cmd_vel_timeout=0.001)

@@ -142,20 +142,6 @@ def test_where_the_heading_counts_the_robot_turns_in_place_at_the_end(name, take
 # --- Limits
 
 
-@pytest.mark.parametrize('target', [(5.0, 2.0), (-5.0, 0.1), (0.3, -2.0)])
-def test_limits_keep_the_curvature(target):
-    values = {
-        'linear_x_max_velocity': 0.1,
-        'linear_x_min_velocity': 0.0,
-        'angular_z_max_velocity': 2.0,
-        'angular_z_min_velocity': -0.3,
-    }
-    free = command(steering(), goal(target), at(0, 0))
-    limits = VelocityLimits(max_v=0.1, min_v=0.0, max_omega=2.0, min_omega=-0.3)
-    expected = pytest.approx(saturate(*free, limits, 1.0, 1.0))
-    assert command(steering(**values), goal(target), at(0, 0)) == expected
-
-
 # --- Paths
 
 
@@ -165,19 +151,6 @@ def test_a_path_may_begin_only_so_far_from_the_robot():
     assert steering(max_path_distance=0.6).begin(pursuit, (0.5, 0.3, 0.0)) is pursuit
     with pytest.raises(ValueError, match=r'within max_path_distance, 0\.9 m, of the robot, got 1 m'):
         steering(max_path_distance=0.9).begin(pursuit, (0.0, 0.0, 0.0))
-
-
-def test_waypoints_are_passed_along_a_path_from_the_robot_if_chosen():
-    several = Pursuit.of(goal((1, 0), (2, 1)))
-    assert steering().begin(several, (0.0, 0.0, 0.0)) is several
-    steer = steering(pass_waypoints=True)
-    passing = steer.begin(several, (0.0, 0.0, 0.0))
-    assert passing.follower.passing
-    assert passing.follower.path.poses[0].tolist() == [0.0, 0.0, 0.0]
-    assert (passing.index, several.follower) == (0, None)
-    # One goal, and goals where the robot is, have no path.
-    for places in ([(1, 0)], [(0, 0), (0, 0)]):
-        assert steer.begin(Pursuit.of(goal(*places)), (0.0, 0.0, 0.0)).follower is None
 
 
 def test_the_end_of_a_path_is_a_goal_and_lateness_is_by_its_times():
@@ -194,3 +167,10 @@ def test_the_end_of_a_path_is_a_goal_and_lateness_is_by_its_times():
     assert pursuit.lateness(5 * SECOND) == ', 2.0 s later than by its times'
     assert pursuit.lateness(2 * SECOND) == ', 0.0 s later than by its times'
     assert Pursuit.of(path((0, 0), (1, 0))).lateness(SECOND) == ''
+
+
+def test_one_goal_and_waypoints_where_the_robot_is_have_no_path():
+    steer = steering(pass_waypoints=True)
+    for places in ([(1, 0)], [(0, 0), (0, 0)]):
+        assert steer.begin(Pursuit.of(goal(*places)), (0.0, 0.0, 0.0)).follower is None
+    assert steer.begin(Pursuit.of(goal((1, 0), (2, 1))), (0.0, 0.0, 0.0)).follower.passing
