@@ -158,3 +158,4 @@ def test_states_are_those_of_action_msgs_and_either_active_or_ended():
     assert {*ACTIVE, *ENDED, GoalState.UNKNOWN} == set(GoalState) == set(FOLLOWING)
     assert all(state.active != state.ended for state in GoalState if state)
     assert not any(FOLLOWING[state] for state in ENDED)
+    assert [state.word for state in ENDED] == ['arrived', 'canceled', 'aborted']

@@ -12,7 +12,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
-from support.ros_messages import odometry, receive
+from support.ros_messages import odometry, receive, spoiled
 
 from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.drives import in_lockstep, overrides
@@ -59,7 +59,7 @@ def test_invalid_goals_and_topics_are_named(ros):
         add_client(ros, [[0.0, 0.0, 0.0]])
 
 
-def test_distance_is_that_of_the_point_the_controller_drives(ros):
+def test_distance_is_that_of_the_point_the_controller_drives(ros, capfd):
     client = add_client(ros, [[1.0, 0.0, 0.0]], topic='goal_pose')
     node = ros.add(GoToGoal, parameters={'controller': 'offset_point', 'offset': 0.25})
     watch = Liveness(client, ['/go_to_goal', '/missing'], DRIVEN_POINT_PARAMETERS)
@@ -70,7 +70,9 @@ def test_distance_is_that_of_the_point_the_controller_drives(ros):
     assert client.distance == math.inf
     client.arrival = Arrival(offset=offset)
     receive(client, '/odom', odometry(0.0, 0.0, 0.0))
+    receive(client, '/odom', spoiled(odometry(9.0, 0.0, 0.0), 'header.stamp.sec', -1))
     assert client.distance == 0.75
+    assert 'odometry dropped: its stamp must' in capfd.readouterr().err
     for values in ({}, {'controller': 'offset_point', 'offset': math.nan}):
         assert driven_offset(values) == 0.0
 

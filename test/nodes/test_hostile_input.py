@@ -67,8 +67,9 @@ def test_a_value_of_an_unknown_type_is_refused_and_the_others_are_set(
     assert [one.successful for one in results] == [False, True, False]
     assert "parameter 'kp' must have a type in 0 to 9, got type 10" in results[0].reason
     assert node.parameters.kp == 2.0
+    assert set_parameters(double('kp', 3.0))[0].successful
     # Of an atomic request nothing is set.
-    for others, expected in (([of_type('kv', 10)], 2.0), ([], 4.0)):
+    for others, expected in (([of_type('kv', 10)], 3.0), ([], 4.0)):
         request = SetParametersAtomically.Request(parameters=[double('kp', 4.0), *others])
         service = 'go_to_goal/set_parameters_atomically'
         result = lockstep.call(SetParametersAtomically, service, request).result

@@ -72,6 +72,15 @@ def test_the_true_pose_is_not_forgotten_when_a_drift_ends(bench):
     assert bench.robot.true_pose_tuple != bench.robot.pose_tuple
 
 
+@pytest.mark.parametrize('noticed', [False, True])
+def test_a_push_is_noticed_or_not(bench, noticed):
+    bench.defects.push((0.0, 0.5, 0.0), noticed=noticed)
+    truth, odometry = bench.robot.true_pose_tuple, bench.robot.pose_tuple
+    assert truth == pytest.approx((1.0, 0.5, 0.0))
+    assert odometry == pytest.approx(truth if noticed else (1.0, 0.0, 0.0))
+    assert len(bench.placed) == noticed
+
+
 def test_encoders_go_on_from_the_pose_of_those_before_or_where_the_odometry_is_placed(bench):
     bench.defects.set_encoders(4)
     bench.now += SECOND // 3

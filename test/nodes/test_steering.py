@@ -142,6 +142,18 @@ def test_where_the_heading_counts_the_robot_turns_in_place_at_the_end(name, take
 # --- Limits
 
 
+def test_a_robot_does_not_turn_by_more_than_a_half_turn_between_two_messages():
+    behind, steer = Pursuit.of(goal((-1, 1e-3))), steering(kp=100.0)
+    _, free = steer.command(behind, at(0, 0), SECOND, math.inf)[1]
+    assert free == pytest.approx(100.0 * math.pi, rel=1e-3)
+    for rate in (5.0, 30.0, 45.0):
+        _, omega = steer.command(behind, at(0, 0), SECOND, rate)[1]
+        assert abs(omega) <= math.pi * rate
+        # Whole turns less: the robot faces there at the next message.
+        turns = (free - omega) / (math.tau * rate)
+        assert turns == pytest.approx(round(turns))
+
+
 # --- Paths
 
 
