@@ -61,7 +61,7 @@ def test_a_braked_robot_comes_to_rest_within_the_room_wherever_it_is_stopped(lag
     actuators = dataclasses.replace(ACTUATORS, lag=lag, delay=delay)
     model = RobotModel(actuators=actuators)
     used = []
-    for _ in range(10):
+    for _ in range(4):
         room, turn = chance.uniform(0.0, 0.5), chance.choice((math.inf, chance.uniform(0.5, 3.0)))
         braking, stamp = Braking(actuators), 0
         robot = Robot(model=model, stamp=0, pose=(0.0, 0.0, 0.0))
