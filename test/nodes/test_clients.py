@@ -68,6 +68,7 @@ def test_distance_is_that_of_the_point_the_controller_drives(ros, capfd):
     offset = driven_offset(watch.values['/go_to_goal'])
     assert node.arrival.offset == offset
     assert client.distance == math.inf
+    assert client.cancel_answer == ''
     client.arrival = Arrival(offset=offset)
     receive(client, '/odom', odometry(0.0, 0.0, 0.0))
     receive(client, '/odom', spoiled(odometry(9.0, 0.0, 0.0), 'header.stamp.sec', -1))
