@@ -52,12 +52,12 @@ def get(server, path, **headers):
         return answer.status, answer.headers, answer.read()
 
 
-def page(server, *, path=None, origin='own', host=None):
+def page(server, *, path=None, **headers):
     """Open the websocket, as a page of some origin would."""
-    own = f'http://127.0.0.1:{server.port}'
+    own = f'127.0.0.1:{server.port}'
     return connect(
-        f'ws://{host or f"127.0.0.1:{server.port}"}{path or f"/{server.access.token}/socket"}',
-        origin=own if origin == 'own' else origin,
+        f'ws://{headers.get("host", own)}{path or f"/{server.access.token}/socket"}',
+        origin=headers.get('origin', f'http://{own}'),
         sock=socket.create_connection(('127.0.0.1', server.port), timeout=20),
         proxy=None,
         open_timeout=20,
@@ -66,12 +66,45 @@ def page(server, *, path=None, origin='own', host=None):
 
 # --- Access
 
+OWN = '127.0.0.1:8000'
+FORWARDED = 'localhost:9000'
+
+
+def test_the_token_gives_access_to_page_and_socket():
+    access = Access()
+    for path, found in (
+        ('', ('page', 'index.html')),
+        ('main.js', ('page', 'main.js')),
+        ('theme.css?x=1', ('page', 'theme.css')),
+        ('socket', ('socket', '')),
+    ):
+        for host in (OWN, FORWARDED):
+            assert access.check(f'/{access.token}/{path}', [host], [f'http://{host}']) == found
+    assert len(access.token) >= 32
+    assert access.token != Access().token
+
+
+def test_others_have_no_access():
+    """A page of evil.example may come with a name that now leads to 127.0.0.1: DNS rebinding."""
+    access = Access()
+    for path in ('', 'index.html', 'x/main.js', '/', 'open/', 'open/x', 'socket', '\udcff/'):
+        assert access.check(f'/{path}', [OWN], []) is Refusal.TOKEN, path
+    page, socket = f'/{access.token}/', f'/{access.token}/socket'
+    for host in ('evil.example', '127.0.0.1.evil.example', '127.0.0.1@evil', '10.0.0.1', ''):
+        assert access.check(page, [host], []) is Refusal.HOST, host
+        assert access.check(socket, [host], [f'http://{host}']) is Refusal.HOST, host
+    assert access.check(page, [OWN, OWN], []) is Refusal.HOST
+    for origin in ('null', f'https://{OWN}', 'http://127.0.0.1', f'http://{OWN}.evil.example'):
+        assert access.check(page, [OWN], [origin]) is Refusal.ORIGIN, origin
+        assert access.check(socket, [OWN], [origin]) is Refusal.ORIGIN, origin
+    # Browsers send the origin with every websocket.
+    assert access.check(socket, [OWN], []) is Refusal.ORIGIN
+
 
 def test_the_page_with_its_token(server):
-    for name in ('', 'index.html', 'main.js', 'theme.css?x=1'):
-        status, headers, body = get(server, f'/{server.access.token}/{name}')
-        assert status == 200
-        assert body
+    status, headers, body = get(server, f'/{server.access.token}/')
+    assert status == 200
+    assert body
     assert headers['X-Content-Type-Options'] == 'nosniff'
     policy = headers['Content-Security-Policy']
     assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self'")
@@ -79,54 +112,26 @@ def test_the_page_with_its_token(server):
     assert 'unsafe' not in policy
     assert headers['Referrer-Policy'] == 'no-referrer'
     assert 'Set-Cookie' not in headers
-
-
-def test_without_the_token_nothing_is_served(server):
-    for path in ('/', '/index.html', '/x/main.js', '/%00/', '//', '/../', '/open/x', '/socket'):
-        status, headers, body = get(server, path)
-        assert (status, b'token' in body) == (403, True), path
-        assert 'Content-Security-Policy' in headers
-    for path in ('/socket', '/wrong/socket', '/', '/open/x'):
-        assert refused(server, path=path), path
-
-
-def test_only_the_files_of_the_page_are_served(server):
     for name in ('../server.py', '%2e%2e/server.py', '/etc/passwd', 'no.js', '..'):
         assert get(server, f'/{server.access.token}/{name}')[0] == 404, name
 
 
-def refused(server, **opened):
-    """Return whether the server refuses to open a websocket."""
-    with pytest.raises(InvalidStatus, match='403'):
-        page(server, **opened)
-    return not session_of(server).watched
-
-
-def test_another_name_of_this_machine_is_refused(server):
-    """DNS rebinding: a page of evil.example, whose name now leads to 127.0.0.1."""
+def test_requests_without_access_are_refused(server):
+    status, headers, body = get(server, '/')
+    assert (status, b'token' in body) == (403, True)
+    assert 'Content-Security-Policy' in headers
     path = f'/{server.access.token}/'
-    for host in ('127.0.0.1@evil', ''):
-        assert get(server, path, Host=host)[0] == 403, host
-    for host in ('evil.example', 'evil.example:80', '127.0.0.1.evil.example', '10.0.0.1'):
-        assert get(server, path, Host=host)[0] == 403, host
-        assert refused(server, host=host, origin=f'http://{host}')
-    # A forwarded port.
-    for host in (f'localhost:{server.port}', 'localhost:9000', '127.0.0.1:9000'):
-        assert get(server, path, Host=host)[0] == 200
-        with page(server, host=host, origin=f'http://{host}'):
-            pass
-
-
-def test_a_page_of_another_origin_cannot_connect(server):
-    """Even if it knew the token."""
-    own = f'127.0.0.1:{server.port}'
-    assert refused(server, origin=None)
-    for origin in (
-        *('null', 'http://evil.example', f'https://{own}', 'http://127.0.0.1', 'http://127.0.0.1:1'),
-        *(f'http://localhost:{server.port}', f'http://{own}.evil.example'),
+    assert get(server, path, Host='evil.example')[0] == 403
+    assert get(server, path, Origin='http://evil.example')[0] == 403
+    for opened in (
+        {'path': '/wrong/socket'},
+        {'host': 'evil.example', 'origin': 'http://evil.example'},
+        {'origin': None},
+        {'origin': 'http://evil.example'},
     ):
-        assert refused(server, origin=origin), origin
-        assert get(server, f'/{server.access.token}/', Origin=origin)[0] == 403, origin
+        with pytest.raises(InvalidStatus, match='403'):
+            page(server, **opened)
+    assert not session_of(server).watched
 
 
 def test_the_ticket_opens_the_page_once(server):
@@ -134,16 +139,7 @@ def test_the_ticket_opens_the_page_once(server):
     assert server.access.token not in path
     status, headers, _ = get(server, path)
     assert (status, headers['Location']) == (303, f'/{server.access.token}/')
-    assert get(server, path)[0] == 403
-
-
-def test_tokens_are_long_and_differ():
-    first, second = Access(), Access()
-    assert len(first.token) >= 32
-    assert first.token != second.token
-    assert first.check('/\udcff\udcfe/', ['localhost'], []) is Refusal.TOKEN
-    assert first.check(f'/{second.token}/', ['localhost'], []) is Refusal.TOKEN
-    assert first.check(f'/{first.token}/', ['localhost', 'localhost'], []) is Refusal.HOST
+    assert get(server, path)[0] == get(server, '/open/')[0] == 403
 
 
 def test_it_listens_on_this_machine_only(server):
