@@ -244,7 +244,7 @@ def shown_rows(values, *, path=False):
 
 def test_settings_that_are_shown_and_taken():
     values = {'kp': 3.0, 'my_gain': 2.0, 'controller': 'mine', 'linear.x.max_velocity': math.nan}
-    rows = shown_rows(values)
+    rows = shown_rows({**values, 'other_gain': math.nan, 'Odd.name': 1.0})
     # Of a law that is not known here what is no parameter of every go_to_goal, which kp is.
     assert set(rows) == {'my_gain', 'controller', 'linear.x.max_velocity'}
     assert rows['controller']['choices'][-1] == 'mine'
