@@ -49,12 +49,10 @@ WRONG = {
     'drive_to': {
         '': 'X Y',
         '1': 'got 1 of them',
-        'one two': "'one'",
         "'' 0": "''",
         'nan 0': 'X Y: must be finite, got nan',
         '1e308 0': 'X Y: must be in [-1e+06, 1e+06] m, got 1e+308',
         '1 1 --tolerance 0': '--tolerance: must be in [1e-06, 100], got 0.0',
-        '1 1 --tolerance abc': "--tolerance: must be a number, got 'abc'",
         '1 1 --timeout -1e-3': '--timeout: must be positive and finite, got -0.001',
         '1 1 --params-file nowhere.yaml': "no such file: 'nowhere.yaml'",
         '1 1 --kp 2': 'unrecognized arguments: --kp 2 (kp is a ROS parameter: --ros-args -p kp:=2)',
@@ -66,7 +64,6 @@ WRONG = {
         '1 1 --no-record --ros-args -p kp:=2.0 --open': 'come before --ros-args',
         '1 1 --no-record --lockstep --ros-args -p kp:=2.0 -o x': "unknown ROS arguments: ['-o', 'x']",
         '1 1 --no-record --lockstep --ros-args -p wheel_radius:=-1.0': "'wheel_radius' must be in [0",
-        '1 1 --no-record --params-file malformed.yaml': 'malformed.yaml',
         '1 1 --lockstep --open': '--lockstep and --open exclude each other',
         '1 1 --controller pid': "invalid choice: 'pid' (choose from '",
         '1 1 --robot r2d2': "must be one of 'create3', 'turtlebot3_burger', got",
@@ -75,7 +72,6 @@ WRONG = {
         '1 1 --force': '--force has no effect without --output',
         '--path circle:1 1 1': '--path excludes X Y and --heading',
         '1 1 --speed 0.3': '--speed has no effect without --path',
-        '1 1 --no-record --no-plot': '--no-plot has no effect with --no-record',
         '1 1 --trajectory 0.3': '--trajectory has no effect without --path',
         '--path circle:1 --speed 0.3 --trajectory 0.3': '--speed has no effect with --trajectory',
         '1 1 --no-record --lockstep --ros-args -p Kp:=3.0': "parameter 'Kp'; did you mean 'kp'?",
@@ -87,60 +83,49 @@ WRONG = {
     },
     'go_to_goal': {
         '1 1': '1 1 (send_goal X Y sends a goal)',
-        '--robott create3': '--robott create3 (did you mean --robot?)',
         '--ros-args -p Kp:=3.0': "no node of this program has the parameter 'Kp'; did you mean 'kp'?",
         '--ros-args -p kp:=fast': "'kp' must be a double (as 1.0), got 'fast'",
         '--ros-args -p qos_overrides./odom.subscription.reliability:=often': 'often',
         '--ros-args -p qos_overrides./odom.subscription.depth:=-3': 'depth',
-        '--ros-args --params-file nowhere.yaml': 'nowhere.yaml',
         '--ros-args --params-file malformed.yaml': 'malformed.yaml',
         '--ros-args -- --bogus': '--bogus',
     },
     'plot_run': {
         'run --topic odom=/a --topic odom=/b': '--topic can be given once for each name',
         'run --topic odom': 'NAME=TOPIC',
-        'run --topic speed=/x': 'NAME=TOPIC',
         'run --namespace a-b': 'must be a namespace',
     },
     'record_run': {
         '--force': '--force has no effect without --output',
         '--all -e odom': '--regex has no effect with --all',
         '\udcff': r"TOPIC: must be the name of a topic, got '\udcff'",
-        '-o x.db3': 'must name a bag, which is a directory',
         'odom --all': 'TOPIC has no effect with --all',
-        '--param x:=1': AFTER,
     },
     'replay_run': {
         'run --timeout 1': '--timeout needs -w',
         'run --topics /a --namespace b': '--namespace has no effect with --topics',
         'run --loop --wait-for-all-acked 1': '--wait-for-all-acked has no effect with --loop',
         'run --start-paused': '--start-paused needs a terminal',
-        'run --log-level debug': AFTER,
     },
     'send_goal': {
-        '1 1 --no-wait --timeout 5': '--timeout has no effect with --no-wait',
         '1 1 --heading 90': '--degrees accepts them',
         '1 1 --heading 400 --degrees': 'from -360 to 360 degrees',
         '1 1 --degrees': '--degrees needs --heading',
-        '1 1 -p x:=1': AFTER,
     },
     'send_path': {
         'circle:1 --no-wait --timeout 5': '--timeout has no effect with --no-wait',
         'circle:0': 'size of a shape must be in [0.001, 100000] m',
-        'eight:1e308': 'size of a shape must be in [0.001, 100000] m',
         'circle:1 --speed 0.3': 'path_speed of the controller, or that of --trajectory, got',
         'missing.csv': 'missing.csv: there is no such file',
         'square:1': 'path must be circle:RADIUS, line:LENGTH, eight:SIZE',
     },
     'sweep_gains': {
         '--kp -1e-3 2': 'kp must be in (0, 100], got -0.001',
-        '--kv 1 101': 'kv must be in (0, 100], got 101',
         '--kp 3 2': 'kp must be MIN MAX with MIN < MAX, got (3.0, 2.0)',
         '--kp 2 2.0000000001': 'kp must have 59 different values',
         '--kp 1': 'two gains must be swept, got ranges of none',
         '--grid 2.5': "--grid: must be an integer from 2 to 1000000, got '2.5'",
         '--grid ٣': "--grid: must be an integer from 2 to 1000000, got '٣'",
-        f'--grid {"9" * 99}': '--grid: must be an integer from 2 to 1000000, got 9999',
         '--grid 1000': 'grid 1000 with 12 starts gives 12000000 closed loops; at most 1000000',
         '--duration 1e9': 'which may take an hour; choose a smaller grid',
         '--distance 0.01': 'distance must be larger than tolerance, 0.02 m, and less than',
@@ -161,7 +146,6 @@ WRONG = {
     'watch_run': {
         '--port 0': 'must be an integer from 1 to 65535, got 0',
         '--rate 2': '--rate needs a BAG',
-        'bag --rate -2': 'must be in [0.01, 1000], got -2.0',
         'bag --ros-args -p x:=1': 'a BAG needs no ROS arguments',
     },
     'wheel_bridge': {'--ros-args -p left_wheel_name:=right_wheel_joint': "'left_wheel_name' "},
@@ -235,8 +219,10 @@ def test_what_is_no_bag_is_refused(command, folder):
     (folder / 'a file').write_text('Dear')
     (folder / 'damaged').mkdir()
     (folder / 'damaged' / 'metadata.yaml').write_text('x')
+    for one, other in ('ab', 'ba'):
+        (folder / one).symlink_to(other)
     before = sorted(folder.rglob('*'))
-    for bag in ('missing', 'an empty folder', 'a file', 'damaged'):
+    for bag in ('missing', 'an empty folder', 'a file', 'damaged', 'a'):
         ended = run(command, bag)
         assert ended.code == 2
         assert bag in error_of(command, ended)
@@ -258,25 +244,17 @@ def test_what_is_no_bag_is_refused(command, folder):
 def test_nothing_is_overwritten(folder, command, arguments, names):
     for name in names:
         (folder / name).write_text('precious')
-        ended = run(command, *arguments)
-        assert ended.code != 0
-        assert f'{name} exists already' in error_of(command, ended)
+        assert f'{name} exists already' in refused(command, *arguments, code=2)
         assert (folder / name).read_text() == 'precious'
         (folder / name).unlink()
         if command == 'recover_run':
+            # Nothing is missing in its bag, so nothing would be written.
             continue
         # A link that leads nowhere would be followed.
         (folder / name).symlink_to('nowhere')
-        assert f'{name} exists already' in error_of(command, run(command, *arguments))
+        assert f'{name} exists already' in refused(command, *arguments, code=2)
         (folder / name).unlink()
     assert not list(folder.iterdir())
-
-
-def test_links_that_lead_to_each_other_are_no_bag(folder):
-    for one, other in ('ab', 'ba'):
-        (folder / one).symlink_to(other)
-    for command in ('calibrate_run', 'plot_run', 'recover_run', 'replay_run', 'verify_run'):
-        assert 'there is no bag a' in refused(command, 'a')
 
 
 @pytest.mark.parametrize(
@@ -299,25 +277,28 @@ def test_a_signal_interrupts_and_nothing_is_written(folder, command, arguments):
 
 
 @pytest.mark.process
-@pytest.mark.parametrize(
-    ('command', 'arguments', 'unbuffered'),
-    [('verify_run', (REAL,), ''), ('plot_run', (REAL, '-o', 'a.png'), '1')],
-)
-def test_output_that_cannot_be_written(folder, command, arguments, unbuffered):
-    """A full disk is an error; a reader that has enough, as `head`, is none that is reported."""
+@pytest.mark.parametrize('unbuffered', ['', '1'])
+def test_output_that_cannot_be_written_is_an_error(unbuffered):
+    with open('/dev/full', 'w') as disk:
+        ended = verify(disk, unbuffered)
+    words = 'verify_run: error: the standard output cannot be written: No space left on device\n'
+    assert (ended.returncode, ended.stderr) == (1, words)
+
+
+@pytest.mark.process
+def test_a_reader_that_has_enough_is_no_error_that_is_reported():
+    """As `head`."""
     read, closed = os.pipe()
     os.close(read)
-    full = f'{command}: error: the standard output cannot be written: No space left on device\n'
-    with open('/dev/full', 'w') as disk, open(closed, 'w') as pipe:
-        for stdout, error in ((disk, full), (pipe, '')):
-            ended = forked.run(
-                PROGRAM.format(command),
-                (*arguments, *(('--force',) if command == 'plot_run' else ())),
-                env={**os.environ, 'PYTHONUNBUFFERED': unbuffered},
-                stdout=stdout,
-            )
-            assert (ended.returncode, ended.stderr) == (1, error)
-            assert [one.name for one in folder.iterdir()] == [*arguments[2:]]
+    with open(closed, 'w') as pipe:
+        ended = verify(pipe)
+    assert (ended.returncode, ended.stderr) == (1, '')
+
+
+def verify(stdout, unbuffered=''):
+    """Run verify_run in a process of its own."""
+    environment = {**os.environ, 'PYTHONUNBUFFERED': unbuffered}
+    return forked.run(PROGRAM.format('verify_run'), (REAL,), env=environment, stdout=stdout)
 
 
 def test_a_file_that_cannot_be_finished_is_removed_and_does_not_keep_the_other(folder, monkeypatch):
