@@ -84,21 +84,25 @@ def test_drives_in_lockstep_are_reproducible_and_recorded_where_the_caller_says(
     assert first.distance <= 0.02
 
 
-def test_invalid_arguments_are_named():
-    for options, error, words in (
+@pytest.mark.parametrize(
+    ('options', 'error', 'words'),
+    [
         ({'parameters': {'kp': -1.0}}, UserError, "'kp' must be in"),
         ({'ros_arguments': ['--ros-args', '--no']}, UserError, 'unknown ROS arguments'),
-        ({'isolated': False}, ValueError, 'in lockstep is always isolated'),
-        ({'timeout': math.nan}, ValueError, 'timeout must be positive'),
-        ({'goals': [1.0, 1.0]}, ValueError, r'must have shape \(n, 2\)'),
-    ):
-        with pytest.raises(error, match=words):
-            drive(**{'goals': [[1.0, 1.0]], 'lockstep': True, **options})
-    with in_lockstep() as runner:
-        with pytest.raises(ValueError, match=r'goals must have shape \(n, 2\) or \(n, 3\) with n > 0'):
-            drive(np.zeros((0, 3)), runner=runner)
-        with pytest.raises(ValueError, match='are those of the runner'):
-            drive([[1.0, 1.0]], runner=runner, lockstep=True)
+        ({'isolated': False}, ValueError, 'isolated'),
+        ({'timeout': math.nan}, ValueError, 'timeout'),
+        ({'goals': [1.0, 1.0]}, ValueError, r'goals must have shape \(n, 2\)'),
+        ({'goals': np.zeros((0, 3))}, ValueError, 'goals must have shape'),
+    ],
+)
+def test_invalid_arguments_are_named(options, error, words):
+    with pytest.raises(error, match=words):
+        drive(**{'goals': [[1.0, 1.0]], 'lockstep': True, **options})
+
+
+def test_a_runner_has_its_own_arguments():
+    with in_lockstep() as runner, pytest.raises(ValueError, match='are those of the runner'):
+        drive([[1.0, 1.0]], runner=runner, lockstep=True)
     for name in ('timeout', 'patience'):
         with pytest.raises(ValueError, match=f'{name} must be positive'):
             send_goal([1.0, 1.0, 0.0], **{name: -1.0})
@@ -156,24 +160,13 @@ def drive_to(*arguments, code=0):
     return next(line for line in ended.out.splitlines() if 'the robot stopped' in line)
 
 
-@pytest.mark.parametrize(
-    ('goals', 'options'),
-    [
-        ((-0.2, 0), ('--params-file', CONFIG / 'turtlebot3_burger.yaml')),
-        ((0, 0), ('--params-file', CONFIG / 'create3.yaml')),
-    ],
-    ids=['behind', 'where it is'],
-)
-def test_arrives(goals, options):
-    line = drive_to(*goals, *options, '--no-record', *QUICK_ARGUMENTS)
-    numbers = re.fullmatch(
-        r'arrived: the robot stopped at x (\S+) m, y (\S+) m, heading \S+ rad, '
-        r'(\S+) m from the goal, after (\S+) s of simulated time',
-        line,
-    )
-    x, y, distance, _ = map(float, numbers.groups())
-    assert distance <= 0.02
-    assert math.dist((x, y), goals[-2:]) <= 0.021
+@pytest.mark.parametrize('x', [-0.2, 0])
+def test_arrives_behind_and_where_it_is_with_the_parameters_of_a_file(x):
+    file = CONFIG / 'turtlebot3_burger.yaml'
+    line = drive_to(x, 0, '--params-file', file, *RECORD, *QUICK_ARGUMENTS)
+    found = re.match(r'arrived: the robot stopped at x (\S+) m, y (\S+) m,', line)
+    assert math.dist(map(float, found.groups()), (x, 0)) <= 0.021
+    assert read_run(Path('bag')).of_node('virtual_robot')['wheel_separation'] == 0.16
 
 
 def test_the_true_distance_of_a_robot_that_slips_is_that_of_its_ground_truth():
@@ -197,9 +190,8 @@ def test_a_controller_arrives_and_takes_the_heading_that_is_asked_for(controller
     run = read_run(Path('bag'))
     seen = timeline(run)
     last = seen.goal == 1
-    # Of the point that is driven: it comes to each goal, and nothing is taken for the next one too soon.
-    assert seen.distance[~last].min() <= 0.021
-    assert seen.distance[last].min() <= 0.021
+    # Of the point that is driven: it comes to each goal.
+    assert max(seen.distance[~last].min(), seen.distance[last].min()) <= 0.021
     # The heading matters at the last goal alone.
     error = np.angle(np.exp(1j * (-2.5 - run.odometry.values[:, 2])))
     np.testing.assert_allclose(seen.goal_heading_error[last], error[last], atol=1e-9)
@@ -234,17 +226,14 @@ def test_timeout_is_of_simulated_time_and_nothing_is_driven_afterwards():
     assert not run.cmd_vel_out.values.any()
 
 
-FULL = 20_000
-"""Size at which the disk of a test is full (bytes): less than a drive of a second."""
-
-
 def test_a_full_disk_is_reported(folder, monkeypatch):
     """A drive that arrives, but of which only a part is recorded, is not done."""
     write, written = os.write, []
 
     def limited(descriptor, data):
         if threading.current_thread().name == 'journal':
-            if sum(written) + len(data) > FULL:
+            # Less than a drive of a second.
+            if sum(written) + len(data) > 20_000:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             written.append(len(data))
         return write(descriptor, data)

@@ -38,20 +38,18 @@ def test_the_configurations_of_an_installation_are_found(tmp_path, monkeypatch):
     folder = tmp_path / 'share' / 'diffdrive_jacobian' / 'config'
     folder.mkdir(parents=True)
     (folder / 'rover.yaml').write_text('')
-    # As if the package was not in a clone.
-    monkeypatch.setattr(configuration_files, '__file__', str(tmp_path / 'lib' / 'a' / 'b' / 'c.py'))
-    monkeypatch.setenv('AMENT_PREFIX_PATH', '/nowhere')
-    assert 'rover' not in configurations()
-    monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(['/nowhere', str(tmp_path)]))
-    assert configurations()['rover'] == folder / 'rover.yaml'
-    monkeypatch.delenv('AMENT_PREFIX_PATH')
-    monkeypatch.setattr(configuration_files, '__file__', str(tmp_path / 'a' / 'b' / 'c.py'))
-    assert configurations()['rover'] == folder / 'rover.yaml'
+
+    def found(module, prefixes):
+        monkeypatch.setattr(configuration_files, '__file__', str(tmp_path / module / 'a' / 'b' / 'c.py'))
+        monkeypatch.setenv('AMENT_PREFIX_PATH', prefixes)
+        return configurations()
+
+    assert 'rover' not in found('lib', '/nowhere')
+    assert found('lib', os.pathsep.join(['/nowhere', str(tmp_path)]))['rover'] == folder / 'rover.yaml'
+    assert found('', '')['rover'] == folder / 'rover.yaml'
     # As pip and colcon install. The list of the installed files, which is slow to read, is not needed.
-    site = tmp_path / 'lib' / 'python3' / 'site-packages'
-    monkeypatch.setattr(configuration_files, '__file__', str(site / 'a' / 'b' / 'c.py'))
     monkeypatch.setattr(configuration_files, '_listed_files', lambda: pytest.fail('it reads the list'))
-    assert configurations() == {'rover': folder / 'rover.yaml'}
+    assert found('lib/python3/site-packages', '') == {'rover': folder / 'rover.yaml'}
 
 
 # --- Bags of several robots
