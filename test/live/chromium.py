@@ -13,6 +13,8 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+from websockets.sync.client import connect
+
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
 PATIENCE = 30.0
 """How long anything may take (s)."""
@@ -28,8 +30,6 @@ class Browser:
     """A browser with one tab."""
 
     def __init__(self, width=1280, height=800):
-        from websockets.sync.client import connect
-
         self._profile = tempfile.mkdtemp(prefix='chromium')
         self._process = subprocess.Popen(
             [
@@ -48,8 +48,6 @@ class Browser:
         self._ids = itertools.count(1)
         self.errors = []
         """What the page reported on its console as errors, and refused requests."""
-        self.requests = []
-        """Addresses that the page has requested."""
         port_file = Path(self._profile, 'DevToolsActivePort')
         until(lambda: port_file.exists() and len(port_file.read_text().split()) == 2, 'chromium starts')
         port, path = port_file.read_text().split()
@@ -62,7 +60,7 @@ class Browser:
         target = self.call('Target.createTarget', url='about:blank')['targetId']
         attached = self.call('Target.attachToTarget', targetId=target, flatten=True)
         self._session = attached['sessionId']
-        for domain in ('Page', 'Runtime', 'Network', 'Log'):
+        for domain in ('Page', 'Runtime', 'Log'):
             self.call(f'{domain}.enable')
 
     def freeze(self, seconds):
@@ -96,10 +94,6 @@ class Browser:
             self.errors.append(details.get('exception', {}).get('description', details['text']))
         elif method == 'Log.entryAdded' and values['entry']['level'] == 'error':
             self.errors.append(f'{values["entry"]["text"]} {values["entry"].get("url", "")}')
-        elif method == 'Network.requestWillBeSent':
-            self.requests.append(values['request']['url'])
-        elif method == 'Network.webSocketCreated':
-            self.requests.append(values['url'])
 
     def open(self, url):
         """Go to an address, and wait for the page."""

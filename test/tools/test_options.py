@@ -96,9 +96,8 @@ def test_a_bag_of_several_robots_is_read_by_namespace(robots, tmp_path, monkeypa
     monkeypatch.setattr(rendering, 'render', lambda *_: b'picture')
     ended = run('plot_run', robots, '--namespace', 'two', '--csv', tmp_path / 'two.csv')
     assert (ended.code, Path(ended.out.splitlines()[0]).name) == (0, 'two_two.png')
-    assert np.loadtxt(tmp_path / 'two.csv', delimiter=',', skiprows=1, usecols=1)[0] == pytest.approx(
-        5.0, abs=0.05
-    )
+    x = np.loadtxt(tmp_path / 'two.csv', delimiter=',', skiprows=1, usecols=1)
+    assert x[0] == pytest.approx(5.0, abs=0.05)
 
 
 def test_playback_chooses_a_namespace(robots):
