@@ -127,12 +127,6 @@ class Browser:
         )
         self.call('Emulation.setTouchEmulationEnabled', enabled=mobile)
 
-    def scheme(self, name):
-        """Prefer light or dark."""
-        self.call(
-            'Emulation.setEmulatedMedia', features=[{'name': 'prefers-color-scheme', 'value': name}]
-        )
-
     def center(self, selector):
         """Return the middle of an element on the screen (px)."""
         return self.evaluate(

@@ -280,14 +280,6 @@ def test_on_a_path_its_law_drives_and_is_chosen_and_tuned(live, tmp_path):
     live.open(live.child)
 
 
-def test_a_dark_scheme_is_followed(live):
-    ground = 'getComputedStyle(document.body).backgroundColor'
-    light = live.browser.evaluate(ground)
-    live.browser.scheme('dark')
-    live.browser.until(f'{ground} !== {json.dumps(light)}')
-    live.browser.scheme('light')
-
-
 def test_nothing_is_clipped_or_covered_on_usual_screens(live):
     browser = live.browser
     # A notice covers no legend.

@@ -243,15 +243,7 @@ def test_a_page_that_does_not_read_delays_nobody(server):
     """Its states are dropped, what waits is bounded, and storing a state takes no time."""
     session = session_of(server)
     big = [{'name': '/', 'filling': 'x' * 100_000}]
-    with page(server) as reading:
-        raw = socket.create_connection(('127.0.0.1', server.port), timeout=20)
-        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        token = server.access.token
-        raw.sendall(
-            f'GET /{token}/socket HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n'
-            f'Origin: http://127.0.0.1:{server.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n'
-            'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n'.encode()
-        )
+    with page(server) as reading, page(server):
         until(lambda: len(session._pages) == 2, 'both pages')
         before = time.thread_time()
         for number in range(200):
@@ -261,7 +253,6 @@ def test_a_page_that_does_not_read_delays_nobody(server):
         while numbers[-1] != 199:
             numbers.append(json.loads(reading.recv(timeout=20))['world'].get('number', 0))
         assert numbers == sorted(numbers)
-        raw.close()
 
 
 def test_it_ends_while_pages_are_open():

@@ -177,11 +177,6 @@ def test_a_sweep_from_which_nothing_arrives_has_no_numbers():
     assert 'fastest' not in ' '.join(legend(sweep_figure(swept)))
 
 
-def test_gains_of_another_law_are_refused():
-    with pytest.raises(ValueError, match="gains must be of kv, offset, those of 'offset_point'"):
-        SweepSetup(controller='offset_point', gains={'kp': 1.0})
-
-
 # --- Files
 
 
