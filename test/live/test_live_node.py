@@ -155,6 +155,8 @@ def test_waypoints_are_appended_and_the_ends_of_goals_are_reported(driven):
     driven.until(lambda: driven.state() == 'canceled')
     driven.pass_time(0.1)
     assert at_rest(driven.robot())
+    driven.send(CancelGoal('/'))
+    driven.until(lambda: any('no goal is active' in text for text in driven.texts))
     assert [(end.robot, end.state.name) for end in ends] == [('/', 'SUCCEEDED'), ('/', 'CANCELED')]
     np.testing.assert_array_equal([end.goal[:2] for end in ends], [[0.0, 0.2], [5.0, 5.0]])
     for end in ends:

@@ -149,6 +149,13 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+def test_there_are_no_other_commands():
+    assert set(COMMANDS) <= set(dir(entry_points))
+    for name in ('nothing', '_cli', 'run_node'):
+        with pytest.raises(AttributeError, match=f"has no attribute '{name}'"):
+            entry_points.__getattr__(name)
+
+
 @pytest.mark.parametrize('command', COMMANDS)
 def test_help_version_and_wrong_arguments(command, folder):
     helped = run(command, '--help')

@@ -184,6 +184,14 @@ def test_a_bag_without_odometry_is_refused(folder):
     assert list(folder.iterdir()) == [bag]
 
 
+@pytest.mark.usefixtures('undrawn')
+def test_a_table_that_cannot_be_written_does_not_keep_the_picture(bag):
+    # For root, too, there is no such place.
+    ended = plot(bag, '-o', 'a.png', '--csv', '/proc/no/a.csv')
+    assert (ended.code, ended.out) == (1, 'a.png\n')
+    assert commands.error_of('plot_run', ended).startswith('/proc/no/a.csv cannot be written: ')
+
+
 def test_a_file_that_has_come_meanwhile_is_not_overwritten(folder):
     (folder / 'a.png').touch()
     with pytest.raises(FileExistsError):

@@ -177,6 +177,13 @@ def test_a_sweep_from_which_nothing_arrives_has_no_numbers():
     assert 'fastest' not in ' '.join(legend(sweep_figure(swept)))
 
 
+def test_a_setup_checks_itself():
+    with pytest.raises(ValueError, match=r"controller must be one of '.*'offset_point'"):
+        SweepSetup(controller='other')
+    with pytest.raises(ValueError, match="gains must be of kv, offset, those of 'offset_point'"):
+        SweepSetup(controller='offset_point', gains={'kp': 1.0})
+
+
 # --- Files
 
 
