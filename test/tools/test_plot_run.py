@@ -123,6 +123,16 @@ def test_skipped_messages_and_a_table_of_the_runs_are_printed(bag, folder):
     assert ('not arrived' in first, 'no goal' in second) == (True, True)
 
 
+@pytest.mark.usefixtures('undrawn')
+def test_paths_are_printed_without_control_characters(bag, folder):
+    place = folder / os.fsdecode(b'\x1b]0;x\x07 \xff')
+    place.mkdir()
+    escaped = rf'{folder}/\x1b]0;x\x07 \udcff'
+    ended = plot(bag, '-o', place / 'a.png', '--csv', place / 'a.csv')
+    assert ended.out.splitlines()[:2] == [f'{escaped}/a.png', f'{escaped}/a.csv']
+    assert f'{escaped}/a.png exists already' in refused(bag, '-o', place / 'a.png')
+
+
 # --- Files
 
 
