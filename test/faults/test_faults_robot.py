@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import random
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import Topics, change, make
-from support.ros_messages import instants, pose_of, twist, twist_stamped, twists
+from support.ros_messages import instants, pose_of, twist, twists
 
 from diffdrive_jacobian.control import VelocityLimits
 from diffdrive_jacobian.faults.world import Kill
@@ -70,42 +69,6 @@ def test_a_weak_motor_limits_its_own_wheel_after_the_limits_of_the_robot():
     slow = robot.commanded((0.03, 0.1), SECOND)
     # To the bit: what the motors can do is not touched.
     assert slow.twist == (0.03, 0.1)
-
-
-class LaggingWheel:
-    """A wheel whose speed s approaches a goal g: tau ds/dt = g - s, solved exactly."""
-
-    def __init__(self, tau, most):
-        self.tau, self.most, self.angle, self.speed = tau, most, 0.0, 0.0
-
-    def turn(self, goal, seconds):
-        goal = min(max(goal, -self.most), self.most)
-        decay = math.exp(-seconds / self.tau)
-        self.angle += goal * seconds + (self.speed - goal) * self.tau * (1.0 - decay)
-        self.speed = goal + (self.speed - goal) * decay
-
-
-def test_wheels_approach_random_commands_with_their_lag_until_the_timeout():
-    chance, timeout = random.Random(1), 0.5
-    for _ in range(10):
-        tau, most = 10.0 ** chance.uniform(-3.0, 0.3), [chance.choice([math.inf, 5.0, 0.0]), 4.0]
-        wheels = [LaggingWheel(tau, one) for one in most]
-        actuators = Actuators(lag=tau, max_right_speed=most[0], max_left_speed=most[1])
-        robot = at_rest(actuators=actuators, command_timeout=round(timeout * SECOND))
-        time = 0
-        for _ in range(4):
-            v, omega = chance.gauss(0.0, 0.3), chance.gauss(0.0, 2.0)
-            robot, expires = robot.commanded((v, omega), time), time / SECOND + timeout
-            for _ in range(3):
-                later = time + round(chance.uniform(0.001, 0.4) * SECOND)
-                driven = min(max(expires - time / SECOND, 0.0), (later - time) / SECOND)
-                for wheel, goal in zip(wheels, body_to_wheel(v, omega, R, L), strict=True):
-                    wheel.turn(goal, driven)
-                    wheel.turn(0.0, (later - time) / SECOND - driven)
-                time, robot = later, robot.at(later)
-                angles, speeds = zip(*((one.angle, one.speed) for one in wheels), strict=True)
-                assert robot.wheel_angles == pytest.approx(angles, rel=1e-9, abs=1e-9)
-                assert robot.wheel_speeds == pytest.approx(speeds, rel=1e-9, abs=1e-9)
 
 
 def test_a_lagging_robot_reaches_the_command_and_is_then_an_ordinary_one():
@@ -233,18 +196,6 @@ def test_a_lagging_robot_is_seen_in_its_odometry_and_commands(lockstep, robot_at
     # cmd_vel_out has the targets.
     assert [one.twist.linear.x for one in topics.applied][-2:] == [0.2, 0.0]
     assert np.diff(instants(topics.applied))[-1] == SECOND // 2
-
-
-def test_a_stamped_command_is_obeyed_while_the_robot_lags(lockstep, robot_at):
-    robot_at(enable_stamped_cmd_vel=True)
-    topics = Topics(lockstep, command=TwistStamped)
-    lockstep.inject(ActuatorLag(0.3))
-    for v in (0.2, -0.2):
-        lockstep.publish('cmd_vel', twist_stamped(v, 0.0, max(SECOND, lockstep.now - 30_000_000)))
-        lockstep.run_for(0.1)
-    assert [one.twist.linear.x for one in topics.applied][-2:] == [0.2, -0.2]
-    seen = [one.twist.twist.linear.x for one in topics.odom]
-    assert seen[-1] < max(seen) < 0.1
 
 
 def test_coarse_encoders_in_a_world(lockstep, robot_at):

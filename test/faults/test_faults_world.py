@@ -179,6 +179,8 @@ def test_faults_are_values_whose_short_expressions_make_them_again():
 
 INVALID = [
     (lambda: faults.Loss(''), "topic must be a string that is not empty, got ''"),
+    (lambda: faults.Loss('x-y'), "topic must be a name as ROS has them, got 'x-y': "),
+    (lambda: faults.LateService('1x', 1.0), "service must be a name as ROS has them, got '1x': "),
     (lambda: faults.Loss('a', node=3), 'node must be a string, got 3'),
     (lambda: faults.Loss('a', probability=1.5), 'probability must be in [0, 1], got 1.5'),
     (lambda: faults.Loss('a', probability='x'), "probability must be a number, got 'x'"),
