@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 from action_msgs.msg import GoalStatus
-from fork_server import forked
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from support.lockstep_nodes import make
+from support.processes import run_python
 from support.ros_messages import goal
 
 from diffdrive_jacobian import faults
@@ -98,5 +98,5 @@ def test_random_schedules_are_the_same_each_time_also_in_another_process():
         f'import sys; sys.path[:0] = {[str(here), str(here.parent)]}\n'
         f'import test_faults_same as t; print(*[t.drive(number)[0] for number in range({SCHEDULES})])'
     )
-    run = forked.run(program, timeout=120)
+    run = run_python(program, timeout=120)
     assert run.stdout.split() == [digest for digest, _ in first], run.stderr

@@ -11,8 +11,7 @@ from collections import Counter
 from contextlib import contextmanager
 
 import pytest
-from external_nodes import Stage
-from forked_nodes import command, send, started_in_forks
+from external_nodes import Stage, command, send
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterType
@@ -42,13 +41,6 @@ pytestmark = pytest.mark.process
 SECOND = 1_000_000_000
 GO_TO_GOAL = [sys.executable, '-c', PROGRAM.format('go_to_goal')]
 QUICK = ['--ros-args', '-p', 'kp:=24.0', '-p', 'kv:=12.0']
-
-
-@pytest.fixture(autouse=True, scope='module')
-def forks():
-    """Nodes of `external_nodes` run in forks. Other programs are started as usual."""
-    with started_in_forks():
-        yield
 
 
 def stamp(message):

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from forked_nodes import command, send, started_in_forks
+from external_nodes import command, send
 from rcl_interfaces.srv import SetParameters
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
@@ -27,13 +27,6 @@ from diffdrive_jacobian.lockstep.external.threads import Threads
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
 pytestmark = pytest.mark.process
-
-
-@pytest.fixture(autouse=True, scope='module')
-def forks():
-    """Nodes of `external_nodes` run in forks. Other programs are started as usual."""
-    with started_in_forks():
-        yield
 
 
 def fails(match):

@@ -10,8 +10,8 @@ import sys
 import warnings
 
 import pytest
-from fork_server import forked
 from support.inner_sessions import OPTIONS, SETTING, draw_quickly, run_inner
+from support.processes import start_python
 from support.ros_messages import twist
 
 from diffdrive_jacobian.bags import read_run
@@ -228,7 +228,7 @@ def test_parallel_worlds_do_not_hear_each_other(pytester):
     for me, other, speed in (('a', 'b', '1.0'), ('b', 'a', '-1.0')):
         environment = {**os.environ, 'SPEED': speed, 'ME': me, 'OTHER': other}
         environment.pop('ROS_AUTOMATIC_DISCOVERY_RANGE')
-        processes.append(forked.Popen(session, ['-q', *OPTIONS], cwd=pytester.path, env=environment))
+        processes.append(start_python(session, '-q', *OPTIONS, cwd=pytester.path, env=environment))
     assert [process.wait(timeout=60) for process in processes] == [0, 0]
 
 

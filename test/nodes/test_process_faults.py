@@ -9,13 +9,12 @@ from contextlib import suppress
 
 import pytest
 from action_msgs.msg import GoalStatus
-from fork_server import forked
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Goals, Odometry
 from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 from support.damaged_messages import damaged
-from support.processes import Drive
+from support.processes import Drive, start_python
 from support.ros_messages import at_rest, goal, goals, odometry
 
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
@@ -108,7 +107,7 @@ def test_a_flooded_robot_answers_and_stops_when_the_flood_ends(world):
     odometry = world.harness.listen(Odometry, 'odom')
     world.harness.until(lambda: odometry, 'the robot is heard')
     # Two processes, so that there are more messages than can be handled also on a busy machine.
-    floods = [forked.Popen(FLOOD) for _ in range(2)]
+    floods = [start_python(FLOOD) for _ in range(2)]
     try:
         robot.until_says('arrive faster than they are handled')
         assert world.harness.call(Trigger, 'reset_odometry').success

@@ -18,10 +18,9 @@ from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
-from fork_server import forked
 from support.bags import REAL
 from support.commands import COMMANDS, error_of, interrupted, refused, run, run_each
-from support.processes import PROGRAM
+from support.processes import PROGRAM, run_python
 
 from diffdrive_jacobian import __version__
 from diffdrive_jacobian.tools import _cli, entry_points
@@ -288,7 +287,7 @@ def test_a_reader_that_has_enough_is_no_error_that_is_reported():
 def verify(stdout, unbuffered=''):
     """Run verify_run in a process of its own."""
     environment = {**os.environ, 'PYTHONUNBUFFERED': unbuffered}
-    return forked.run(PROGRAM.format('verify_run'), (REAL,), env=environment, stdout=stdout)
+    return run_python(PROGRAM.format('verify_run'), REAL, env=environment, stdout=stdout)
 
 
 def test_a_file_that_cannot_be_finished_is_removed_and_does_not_keep_the_other(folder, monkeypatch):

@@ -42,7 +42,7 @@ def interrupt(children, *numbers):
 
 def test_a_node_exits_0_on_signals_that_do_not_cease(world):
     """From the start of the imports to the last moment of the interpreter."""
-    child = world.start('virtual_robot', fresh=True)
+    child = world.start('virtual_robot')
     child.until_catches(signal.SIGHUP)
     interrupt([child], signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     assert child.exit() == 0
@@ -147,7 +147,7 @@ def test_drive_to_open_survives_invalid_messages_and_reports_where_the_robot_sto
 
 
 def test_drive_to_exits_130_on_signals_while_it_imports(world):
-    child = world.start('drive_to', '--no-record', *FAR, fresh=True)
+    child = world.start('drive_to', '--no-record', *FAR)
     child.until_catches(signal.SIGHUP)
     interrupt([child], signal.SIGINT)
     assert child.exit() == 130

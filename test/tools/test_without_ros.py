@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fork_server import forked
 from support.bags import REAL, SECOND, changed, odom, start, status, write_bag
 from support.commands import COMMANDS, error_of, run, run_each
 from support.ros_messages import goal, goals, joint_command, twist_stamped
@@ -40,7 +39,7 @@ HIDDEN = ABSENT.format(modules=(*ROS_MODULES, 'rpyutils'))
 
 def without_ros(*calls, **kwargs):
     """Run commands in a fork of a process that has never imported ROS."""
-    return run_each(calls, HIDDEN, modules=forked.LIBRARIES, **kwargs)
+    return run_each(calls, HIDDEN, **kwargs)
 
 
 def test_one_line_reports_the_remedy_and_help_needs_no_ros(tmp_path):
@@ -116,7 +115,7 @@ sys.modules.pop('fcntl', None)
 def test_runs_are_drawn_and_verified_where_files_have_no_locks(tmp_path, ours):
     """As on Windows, which has no SIGHUP either."""
     calls = [('plot_run', ours, '-o', 'run.png'), ('verify_run', ours), ('recover_run', ours)]
-    ended = run_each(calls, NO_POSIX, modules=forked.LIBRARIES, cwd=tmp_path)
+    ended = run_each(calls, NO_POSIX, cwd=tmp_path)
     assert [(one.code, one.err) for one in ended[:2]] == 2 * [(0, '')]
     assert (tmp_path / 'run.png').stat().st_size > 10_000
     assert 'is complete: nothing to recover' in ended[2].err
@@ -126,10 +125,10 @@ def test_other_missing_modules(tmp_path):
     """A ROS installation has no rosbags, which is needed in addition. Others are a defect."""
     calls = [(tool, REAL) for tool in ('plot_run', 'recover_run', 'replay_run', 'verify_run')]
     calls += [('drive_to', 1, 1), ('record_run', '-o', 'run')]
-    ended = run_each(calls, ABSENT.format(modules=('rosbags',)), modules=(), cwd=tmp_path)
+    ended = run_each(calls, ABSENT.format(modules=('rosbags',)), cwd=tmp_path)
     for (tool, *_), one in zip(calls, ended, strict=True):
         message = f'{tool}: error: there is no Python module rosbags: call pip install rosbags mcap\n'
         assert one == (1, '', message)
     assert not list(tmp_path.iterdir())
     with pytest.raises(AssertionError, match="ModuleNotFoundError: No module named 'numpy'"):
-        run_each([('drive_to', 1, 1)], ABSENT.format(modules=('numpy',)), modules=())
+        run_each([('drive_to', 1, 1)], ABSENT.format(modules=('numpy',)))
