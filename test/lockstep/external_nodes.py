@@ -205,10 +205,11 @@ class Asking(Echo):
 
 
 class AskingFirst(Node):
-    """Calls a service before it spins."""
+    """Takes its time, and calls a service before it spins."""
 
     def __init__(self, name):
         super().__init__(name)
+        time.sleep(0.7)
         self.first = self.create_publisher(String, f'{name}/first', LATCHED)
         client = self.create_client(Trigger, f'{name}/ask')
         client.wait_for_service()

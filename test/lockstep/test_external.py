@@ -131,7 +131,7 @@ class TestMessages:
         with answering(talking, 'caller/ask'):
             send(talking, 'caller', 0.0, 0.0, 0.0)
         assert numbers(received) == [1.0, 2.0, 3.0]
-        # While the process starts, too.
+        # Before it spins, too, however late it calls.
         first = talking.listen(String, 'askingfirst/first', latched=True)
         assert [one.data for one in first] == ['1']
 

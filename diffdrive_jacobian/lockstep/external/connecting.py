@@ -192,7 +192,6 @@ class Connecting:
                     f'{domain.quiet.describe()}\n{domain.child.describe()}'
                 )
             if graph_changed(domain.node):
-                # The node may wait for a service of the world before it spins.
                 self._discovery.learn()
             passed = time.monotonic() - begin
             if number and passed > STARTING:
@@ -201,7 +200,7 @@ class Connecting:
                 periods += 1
                 if response is None:
                     number = send_request(client, GetParameters.Request(names=['use_sim_time']))
-                self._waiting.wait()
+                self._wait_and_learn()
                 if periods > 1 and not self._spins():
                     # A loop may wait for the time, as by a Rate on the clock of the node.
                     self._before = min(self._before + BEFORE // 20, 0)
@@ -209,6 +208,16 @@ class Connecting:
             time.sleep(PERIOD / 10)
             response = take_response(client) or response
         domain.node.destroy_client(client)
+
+    def _wait_and_learn(self) -> None:
+        """Wait until the process is quiet. Before it spins, it may wait for a service of the world."""
+        quiet = self._domain.quiet
+        patience = Allowance(quiet, self._domain.command.patience)
+        while not (quiet.is_quiet() or quiet.waits_in_callback or patience.is_used_up()):
+            if graph_changed(self._domain.node):
+                self._discovery.learn()
+            time.sleep(PERIOD / 10)
+        self._waiting.wait()
 
     def _end_sleep(self) -> None:
         """Let a process that sleeps before its nodes spin go on, in simulated wall time."""
