@@ -12,13 +12,13 @@ from diffdrive_jacobian.kinematics.inverse_kinematics import METHODS, IKResult, 
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 TOLERANCE = 1e-6
-ROUNDING = 1.0 + 1e-14
-"""Lengths of the same error that are computed in two ways differ by a few units in the last place."""
 DOWNHILL = ('transpose', 'levenberg_marquardt')
 TWO, THREE, FIVE = (PlanarArm(lengths) for lengths in ([1.0, 0.7], [1.0, 0.7, 0.4], [0.5] * 5))
 LONG_FIRST = PlanarArm([1.0, 0.3, 0.2])
 """An arm whose tip cannot come near its base."""
 LONG_CHAIN = PlanarArm([0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2])
+NARROW = {'heading': True, 'limits': (-2.0, 2.0)}
+numeric_or_not = pytest.mark.parametrize('numeric', [False, True], ids=['jacobian', 'no jacobian'])
 every_method = pytest.mark.parametrize('method', METHODS)
 
 
@@ -105,37 +105,37 @@ def test_levenberg_marquardt_converges_from_anywhere(damping):
     task = Task(THREE, heading=True)
     result = task.solve(task.forward(task.anywhere(100, 4)), task.anywhere(100, 5), damping=damping)
     assert result.converged.all()
-    assert np.median(result.iterations) < 30
     assert result.iterations.max() < 100
+
+
+def test_a_short_link_does_not_slow_levenberg_marquardt_down():
+    # The long links have to stay aligned while the short one turns: J is nearly singular all the way.
+    task = Task(PlanarArm([1.0, 1e-4, 1.0]))
+    target, q0 = task.forward(task.anywhere(2000, 13)), task.anywhere(2000, 14)
+    rim = np.linalg.norm(target, axis=1) > 1.999
+    result = task.solve(target[rim], q0[rim], restarts=0)
+    assert result.converged.all()
+    assert result.iterations.max() < 60
 
 
 # --- The steps of documents C and D
 
 
-def test_newton_is_document_cs_and_squares_the_error():
-    task, q = Task(TWO), np.array([0.4, 1.1])
-    goal, r = task.forward(np.array([[0.5, 0.9], q]))
-    results = [task.solve(goal, q, method='newton', max_iterations=k) for k in (1, 2, 3)]
-    step = np.linalg.inv(TWO.jacobian(q)) @ (goal - r)
-    np.testing.assert_allclose(results[0].q, q + step, rtol=1e-12)
-    assert [result.iterations for result in results] == [1, 2, 3]
-    errors = [result.error for result in results]
-    assert errors[1] < 2.0 * errors[0] ** 2
-    assert errors[2] < 2.0 * errors[1] ** 2 + 1e-15
-
-
-def test_the_damped_and_the_transposed_step_are_document_ds():
+def test_the_first_step_is_document_cs_and_document_ds():
     q, goal, m = np.array([0.3, 0.8, -0.5]), np.array([1.3, 1.0, 1.0]), np.array([1.0, 4.0, 0.25])
     J, M = THREE.jacobian(q, heading=True), np.diag(m)
-    downhill = J.T @ M @ pose_difference(goal, THREE.forward_kinematics(q))
+    e = pose_difference(goal, THREE.forward_kinematics(q))
+    downhill = J.T @ M @ e
     best = downhill @ downhill / (downhill @ J.T @ M @ J @ downhill)
     for step, options in (
+        (np.linalg.inv(J) @ e, {'method': 'newton'}),
         (np.linalg.inv(J.T @ M @ J + 1e-3 * np.eye(3)) @ downhill, {'damping': 1e-3}),
         (np.linalg.inv(J.T @ M @ J + 7.0 * np.eye(3)) @ downhill, {'damping': 7.0}),
         (0.9 * best * downhill, {'method': 'transpose'}),
         (0.07 * downhill, {'method': 'transpose', 'alpha': 0.07}),
     ):
         result = Task(THREE, heading=True).solve(goal, q, mask=m, max_iterations=1, **options)
+        assert result.iterations == 1
         np.testing.assert_allclose(result.q, q + step, rtol=1e-10)
 
 
@@ -151,22 +151,10 @@ def test_the_error_falls_with_every_step_that_is_taken(method):
         # It is derived where it stands; a step that is taken back counts, and is not derived. Calls with
         # several rows are for second derivatives.
         errors = [np.linalg.norm(target - task.forward(q)) for q in task.derived if len(q) == 1]
-        assert np.all(np.array(errors[1:]) < ROUNDING * np.array(errors[:-1]))
-        assert result.error <= ROUNDING * errors[-1]
+        assert np.all(np.array(errors[1:]) < (1.0 + 1e-14) * np.array(errors[:-1]))
+        assert result.error <= (1.0 + 1e-14) * errors[-1]
         taken_back += result.iterations - len(errors)
     assert taken_back > 2
-
-
-def test_newton_may_get_worse_and_returns_the_best_it_saw():
-    task, target = Task(TWO), np.full((20, 2), 2.0)
-    results = [
-        task.solve(target, task.anywhere(20, 1), method='newton', max_iterations=steps)
-        for steps in range(1, 12)
-    ]
-    assert np.all(np.diff([result.error for result in results], axis=0) <= 0.0)
-    last = results[-1]
-    np.testing.assert_allclose(np.linalg.norm(target - task.forward(last.q), axis=1), last.error)
-    assert not last.converged.any()
 
 
 # --- What makes no difference
@@ -179,46 +167,26 @@ def in_nanometres(task, target, q0, **options):
     return result._replace(error=1e9 * result.error)
 
 
-def one_after_the_other(task, target, q0, **options):
-    apart = [task.solve(t, q, **options) for t, q in zip(target, q0, strict=True)]
-    return IKResult(*map(np.array, zip(*apart, strict=True)))
-
-
-def with_a_masked_heading(task, target, q0, **options):
-    pose = Task(task.arm, heading=True)
-    return pose.solve(np.insert(target, 2, 3.0, axis=1), q0, mask=[1, 1, 0], **options)
-
-
 def without_a_jacobian(task, target, q0, **options):
-    task.derived.clear()
-    result = task.solve(target, q0, numeric=True, **options)
-    assert not task.derived
-    return result
+    return task.solve(target, q0, numeric=True, **options)
 
 
-def with_functions_that_warn_write_and_use_their_memory_again(task, target, q0, **options):
+def with_functions_that_write_to_their_arguments(task, target, q0, **options):
     def careless(function):
-        memory = np.empty(3000)
-
-        def called(*arguments):
-            value = function(*arguments)
-            kept = memory[: value.size].reshape(value.shape)
-            kept[...] = value
-            np.log(0.0 * arguments[-1], out=arguments[-1])
-            return kept
+        def called(q):
+            value = function(q)
+            q[...] = np.nan
+            return value
 
         return called
 
-    with np.errstate(all='raise'):
-        return solve(careless(task.forward), careless(task.jacobian), target, q0, **options)
-
-
-VARIANTS = in_nanometres, one_after_the_other, with_a_masked_heading, without_a_jacobian
-VARIANTS += (with_functions_that_warn_write_and_use_their_memory_again,)
+    return solve(careless(task.forward), careless(task.jacobian), target, q0, **options)
 
 
 @every_method
-@pytest.mark.parametrize('variant', VARIANTS)
+@pytest.mark.parametrize(
+    'variant', [in_nanometres, without_a_jacobian, with_functions_that_write_to_their_arguments]
+)
 def test_the_result_is_the_same(variant, method):
     task, target = Task(THREE), np.random.default_rng(9).uniform(-2.0, 2.0, (8, 2))
     # Rounding, which differs, grows on the paths of newton and of transpose.
@@ -231,7 +199,7 @@ def test_the_result_is_the_same(variant, method):
 # --- Headings and weights
 
 
-@pytest.mark.parametrize('numeric', [False, True], ids=['jacobian', 'no jacobian'])
+@numeric_or_not
 def test_a_heading_takes_the_short_way_across_half_a_turn(numeric):
     task, q = Task(THREE, heading=True), np.array([1.0, 1.0, 1.1])
     q0 = q + np.array([0.02, 0.02, 0.06])
@@ -240,8 +208,6 @@ def test_a_heading_takes_the_short_way_across_half_a_turn(numeric):
     wrapped = task.solve(target, q0, numeric=numeric)
     np.testing.assert_allclose(wrapped.q, q, atol=1e-4)
     assert wrapped.iterations < 10
-    plain = task.solve(target, q0, numeric=numeric, difference=np.subtract)
-    assert np.abs(plain.q - q).max() > 0.5
     # With differences just at half a turn, too.
     arm = Task(PlanarArm([1.0]), heading=True)
     result = arm.solve(arm.arm.forward_kinematics([3.0]), [math.pi], numeric=numeric, restarts=0)
@@ -271,8 +237,7 @@ def test_leading_axes_broadcast_a_single_target_gives_scalars_and_no_target_is_n
     target, q0 = task.forward(task.bent(3, 10)), task.bent(4)
     table = task.solve(target[:, None], q0)
     assert [field.shape for field in table] == [(3, 4, 3)] + [(3, 4)] * 5
-    assert_same(IKResult(*(field[1] for field in table)), task.solve(target[1], q0))
-    single = task.solve(target[1], q0[2], max_iterations=np.int32(500), tolerance=1e-6)
+    single = task.solve(target[1], q0[2], max_iterations=np.int32(500))
     assert_same(IKResult(*(field[1, 2] for field in table)), single)
     assert [np.shape(field) for field in single] == [(3,)] + [()] * 5
     assert (single.converged.dtype, single.iterations.dtype) == (np.bool_, np.int64)
@@ -280,16 +245,6 @@ def test_leading_axes_broadcast_a_single_target_gives_scalars_and_no_target_is_n
     none = task.solve(np.zeros((0, 4, 2)), np.zeros(3))
     assert [field.shape for field in none] == [(0, 4, 3)] + [(0, 4)] * 5
     assert task.asked == []
-
-
-def test_arguments_stay_as_they_are_and_a_search_that_is_done_ends():
-    target, q0 = np.array([1.0, 1.0]), np.array([0.1, 0.2, 0.3])
-    Task(THREE).solve(target, q0)
-    assert [*target, *q0] == [1.0, 1.0, 0.1, 0.2, 0.3]
-    # It would take hours to go through so many iterations.
-    at_once = Task(THREE).solve(target, q0, tolerance=10, max_iterations=10**9)
-    assert at_once.converged
-    assert not np.shares_memory(at_once.q, q0)
 
 
 @every_method
@@ -347,7 +302,6 @@ def test_what_is_not_finite_ends_its_own_target_only(which, bad, method):
     assert np.array_equal(np.isfinite(result.error), ~lost | (which == 'jacobian'))
     # Some come to where it fails, and those that do not see nothing of it.
     assert np.any(~lost & ~result.converged & (result.iterations < 60))
-    assert np.count_nonzero(result.converged) > 5
     whole = task.solve(target, q0, **options)
     for field, other in zip(result, whole, strict=True):
         assert np.array_equal(field[result.converged], other[result.converged])
@@ -355,30 +309,19 @@ def test_what_is_not_finite_ends_its_own_target_only(which, bad, method):
 
 @every_method
 @pytest.mark.parametrize('scale', [1e-320, 1e-200, 1e150, 1e307])
-def test_numbers_without_measure_neither_raise_nor_warn(scale, method):
-    arm = Task(TWO)
-    target = np.array([[0.4, 0.6], [1.9, 0.3]])
+def test_extreme_numbers_neither_raise_nor_warn(scale, method):
+    arm, target = Task(TWO), np.array([[0.4, 0.6], [1.9, 0.3]])
     for lift, steep in ((scale, 1.0), (1.0, scale), (scale, scale)):
-        forward = partial(lambda lift, q: lift * arm.forward(q), lift)
-        jacobian = partial(lambda steep, q: steep * arm.jacobian(q), steep)
-        options = {'max_iterations': 15, 'tolerance': min(1e-6, 1e-6 * lift) or 5e-324}
-        result = solve(forward, jacobian, lift * target, arm.bent(2), method=method, **options)
+        result = solve(
+            lambda q, lift=lift: lift * arm.forward(q),
+            lambda q, steep=steep: steep * arm.jacobian(q),
+            *(lift * target, arm.bent(2)),
+            **{'method': method, 'max_iterations': 15, 'tolerance': min(1e-6, 1e-6 * lift) or 5e-324},
+        )
         assert np.isfinite(result.q).all()
 
 
-# --- Nearly singular, singular, and out of reach
-
-
-@pytest.mark.parametrize('numeric', [False, True], ids=['jacobian', 'no jacobian'])
-def test_a_short_link_does_not_slow_levenberg_marquardt_down(numeric):
-    # The long links have to stay aligned while the short one turns: J is nearly singular all the way.
-    task = Task(PlanarArm([1.0, 1e-4, 1.0]))
-    target, q0 = task.forward(task.anywhere(2000, 13)), task.anywhere(2000, 14)
-    rim = np.linalg.norm(target, axis=1) > 1.999
-    result = task.solve(target[rim], q0[rim], numeric=numeric, restarts=0)
-    assert len(result.q) > 20
-    assert result.converged.all()
-    assert result.iterations.max() < 60
+# --- Out of reach
 
 
 @pytest.mark.parametrize(
@@ -407,18 +350,13 @@ def test_a_stretched_arm_takes_the_natural_first_try_from_a_point_nearby(method)
     task = Task(PlanarArm([1.0, 1.0]))
     alone = task.solve([1.0, 0.0], [0.0, 0.0], method=method, restarts=0)
     assert alone.iterations == alone.restarts == alone.start == 0
-    assert alone.q.tolist() == [0.0, 0.0]
-    assert alone.error == pytest.approx(1.0)
     result = task.solve([1.0, 0.0], [0.0, 0.0], method=method)
     assert result.converged
     assert result.start == result.restarts == 1
-    np.testing.assert_allclose(task.forward(result.q[np.newaxis])[0], [1.0, 0.0], atol=TOLERANCE)
     assert 0.0 < np.abs(task.derived[2]).max() < 0.1 * np.pi
 
 
 # --- Restarts
-
-NARROW = {'heading': True, 'limits': (-2.0, 2.0)}
 
 
 def test_restarts_find_what_one_search_does_not():
@@ -427,13 +365,7 @@ def test_restarts_find_what_one_search_does_not():
     alone, several = task.solve(target, q0, restarts=0), task.solve(target, q0, restarts=100)
     assert np.count_nonzero(alone.converged) < 52
     assert np.count_nonzero(several.converged) >= 59
-    assert not alone.restarts.any()
-    # The first search is the same but for rounding, and what it finds stays.
-    np.testing.assert_allclose(several.q[alone.converged], alone.q[alone.converged], atol=1e-9)
-    assert np.all(several.error <= alone.error + 1e-12)
     assert np.array_equal(several.start[several.converged], several.restarts[several.converged])
-    off = pose_difference(target, task.forward(several.q))
-    np.testing.assert_allclose(np.linalg.norm(off, axis=1), several.error, atol=1e-14)
 
 
 def test_restarts_are_the_same_for_the_same_seed():
@@ -447,11 +379,10 @@ def test_restarts_are_the_same_for_the_same_seed():
 
 @pytest.mark.parametrize('restarts', [0, 1, 5])
 def test_restarts_end(restarts):
-    task, (target, _, distance) = Task(LONG_FIRST), unreachable(LONG_FIRST)
+    task, (target, _, _) = Task(LONG_FIRST), unreachable(LONG_FIRST)
     result = task.solve(target, task.anywhere(20, 1), restarts=restarts)
     # Three searches with the same end suffice.
     assert np.all(result.restarts == min(restarts, 2))
-    np.testing.assert_allclose(result.error, distance, atol=1e-9)
     few = task.solve(target, task.anywhere(20, 1), restarts=restarts, max_iterations=30)
     assert few.iterations.max() <= 30
 
@@ -499,9 +430,17 @@ def test_restarts_are_drawn_between_the_limits(lower, upper, least, most):
 
 
 @every_method
-@pytest.mark.parametrize('numeric', [False, True], ids=['jacobian', 'no jacobian'])
-def test_solutions_are_within_the_limits(method, numeric):
-    task = Task(THREE, limits=([-3.0, -0.2, -np.inf], [1.0, 2.4, 1.5]))
+@numeric_or_not
+@pytest.mark.parametrize(
+    'limits',
+    [
+        ([-3.0, -0.2, -np.inf], [1.0, 2.4, 1.5]),
+        ([-np.pi, 0.7, -np.pi], [np.pi, 0.7, np.pi]),
+    ],
+    ids=['limited', 'locked'],
+)
+def test_solutions_are_within_the_limits(limits, numeric, method):
+    task = Task(THREE, limits=limits)
     target, q0 = task.forward(task.anywhere(30, 0)), task.anywhere(30, 1)
     result = task.solve(target, q0, numeric=numeric, method=method)
     task.forward(result.q)
@@ -524,20 +463,8 @@ def test_the_nearest_point_within_the_limits_is_found(method):
 
 def test_a_start_beyond_the_limits_is_moved_to_them():
     task = Task(TWO, limits=(0.0, 1.0))
-    assert not task.solve([5.0, 5.0], [-3.0, 4.0], max_iterations=1, restarts=0).converged
+    task.solve([5.0, 5.0], [-3.0, 4.0], max_iterations=1, restarts=0)
     assert task.asked[0].tolist() == [[0.0, 1.0]]
-    assert task.solve(task.forward(np.array([[0.0, 1.0]]))[0], [-3.0, 4.0]).q.tolist() == [0.0, 1.0]
-
-
-@pytest.mark.parametrize('numeric', [False, True], ids=['jacobian', 'no jacobian'])
-def test_a_locked_joint_stays_where_it_is(numeric):
-    task = Task(THREE, limits=([-np.pi, 0.7, -np.pi], [np.pi, 0.7, np.pi]))
-    result = task.solve(task.forward(task.anywhere(30, 0)), task.anywhere(30, 1), numeric=numeric)
-    assert result.converged.all()
-    assert np.all(result.q[:, 1] == 0.7)
-
-
-# --- Size of the update
 
 
 @every_method
@@ -596,14 +523,6 @@ def test_bad_arguments_are_named_with_what_is_allowed(name, values, allowed):
             solve(**ARGUMENTS | {argument: value})
 
 
-@pytest.mark.parametrize(
-    ('changes', 'message'),
-    [
-        ({'target': np.zeros((4, 2)), 'q0': np.zeros((3, 2))}, 'target and q0 must have leading axes'),
-        ({'alpha': 0.0, 'method': 'transpose'}, 'alpha must be positive and finite, got 0.0'),
-        ({'forward': lambda q: q[:1], 'jacobian': None}, 'forward must return'),
-    ],
-)
-def test_bad_combinations_are_reported(changes, message):
-    with pytest.raises(ValueError, match=f'^{message}'):
-        solve(**ARGUMENTS | changes)
+def test_targets_and_starts_that_do_not_fit_together_are_named():
+    with pytest.raises(ValueError, match='^target and q0 must have leading axes'):
+        solve(**ARGUMENTS | {'target': np.zeros((4, 2)), 'q0': np.zeros((3, 2))})
