@@ -59,72 +59,36 @@ def test_gains_of_an_installed_controller_are_parameters_from_the_start(lockstep
     assert described.description == 'Gain on the heading [1/s].'
     (limits,) = described.floating_point_range
     assert (limits.from_value, limits.to_value) == (-20.0, 0.0)
-    result = change(node, k_beta=1.0)
-    assert not result.successful
-    assert 'k_beta' in result.reason
+    assert 'k_beta' in change(node, k_beta=1.0).reason
     with pytest.raises(ParameterError, match="'k_rho' must be in"):
         make(GoToGoal, controller='polar', k_rho=-1.0)
 
 
-def test_gains_are_declared_when_their_controller_is_chosen(lockstep, site):
+def test_gains_are_declared_when_their_controller_is_chosen_in_one_change(lockstep, site, monkeypatch):
     site.install('polar')
-    node = lockstep.add(make(GoToGoal, k_rho=0.7, k_alpha=-1.0))
+    node, changes = lockstep.add(make(GoToGoal, k_rho=0.7, k_alpha=-1.0)), []
+    react = node.parameters_changed
+
+    def changed(before):
+        changes.append(node.parameters.k_rho)
+        react(before)
+
+    monkeypatch.setattr(node, 'parameters_changed', changed)
     assert not node.has_parameter('k_rho')
     assert change(node, controller='polar').successful
     # Given at the start. The other one is out of range.
     assert node.get_parameter('k_rho').value == node.parameters.k_rho == 0.7
+    assert changes == [0.7]
     assert change(node, k_beta=-2.0).successful
     assert change(node, controller='go_to_goal').successful
     assert change(node, controller='polar').successful
     assert node.parameters.k_beta == -2.0
 
 
-def test_a_change_that_declares_gains_is_one_change(lockstep, site, monkeypatch):
-    site.install('polar')
-    node, changes = lockstep.add(make(GoToGoal)), []
-    monkeypatch.setattr(node, 'parameters_changed', changes.append)
-    assert change(node, controller='polar').successful
-    assert [one.controller for one in changes] == ['go_to_goal']
-    assert change(node, controller='polar').successful
-    assert len(changes) == 1
-
-
-def test_a_change_that_declares_gains_knows_what_the_user_gave(lockstep, site, monkeypatch):
-    site.install('polar')
-    node, seen = lockstep.add(make(GoToGoal, k_rho=0.7, k_beta=-2.0)), []
-    monkeypatch.setattr(
-        node,
-        'parameters_changed',
-        lambda _: seen.append((node.parameters.k_rho, node.parameters.k_beta)),
-    )
-    assert change(node, controller='polar').successful
-    assert seen == [(0.7, -2.0)]
-
-
-def test_a_law_that_remembers_forgets_while_the_robot_stands(lockstep):
-    """Or the whole gap would be one step of its integral."""
-    steps = []
-
-    def law(pose, goal, *, state, dt):
-        steps.append((state[0], dt))
-        return 0.1, 0.0, [state[0] + dt]
-
-    own = Controller(name='counting', law=law, gains=(), state=(0.0,))
-    lockstep.add(GoToGoal(controller=own))
-    lockstep.publish('goal_pose', goal(5.0, 0.0))
-    for x in (0.0, 0.01):
-        lockstep.publish('odom', odometry(x, 0.0, 0.0))
-        lockstep.run_for(0.1)
-    lockstep.run_for(2.0)
-    lockstep.publish('odom', odometry(0.02, 0.0, 0.0))
-    assert steps == [(0.0, 0.0), (0.0, pytest.approx(0.1)), (0.0, 0.0)]
-
-
 def test_the_default_of_a_shared_gain_is_that_of_the_controller_chosen():
     own = replace(INTEGRAL, gains=(replace(KP, default=1.5), *INTEGRAL.gains[1:]))
     assert GoToGoalParameters().with_controller(own).at_start({}).kp == 1.5
-    parameters = GoToGoalParameters()
-    assert (parameters.kp, parameters.kv, parameters.offset) == (3.0, 0.5, 0.1)
+    assert GoToGoalParameters().kp == 3.0
 
 
 def test_a_gain_cannot_take_a_name_that_the_node_uses_or_another_range(lockstep):
@@ -157,6 +121,8 @@ def test_help_and_the_page_describe_the_gains_of_the_controller_that_is_chosen(s
 
 # --- Sweeps
 
+SMALL = ('--grid', '2', '--starts', '1', '--rate', '10', '--csv', 'a.csv')
+
 
 def test_three_gains_are_swept_two_at_a_time_and_drawn():
     gains = {'k_alpha': (1.5, 3.0), 'k_beta': -0.3}
@@ -171,18 +137,12 @@ def test_three_gains_are_swept_two_at_a_time_and_drawn():
     how = {'arrival': setup.arrival, 'rate': 10.0}
     alone = closed_loops(POLAR, setup.poses(), np.zeros(3), 0.775, 1.5, -0.3, **how)
     np.testing.assert_array_equal(alone.time, swept.outcomes.time[0, 1])
-    drawn = sweep_figure(swept)
-    assert drawn.get_suptitle().startswith('polar: ')
-    texts = [text.get_text() for text in drawn.axes[3].get_legend().get_texts()]
+    texts = [text.get_text() for text in sweep_figure(swept).axes[3].get_legend().get_texts()]
     assert 'defaults: k_rho 0.5, k_alpha 2' in texts
-
-
-SMALL = ('--grid', '2', '--starts', '1', '--rate', '10', '--csv', 'a.csv')
 
 
 def test_an_installed_controller_is_swept_by_the_tool(site, tmp_path, monkeypatch):
     site.install('polar')
-    site.install('unswept', 'raise RuntimeError("no licence")')
     monkeypatch.chdir(tmp_path)
     arguments = ('--controller', 'polar', '--k_beta', ' -0.8', ' -0.2', '--k_rho', '0.5', *SMALL)
     ended = commands.run('sweep_gains', *arguments)
@@ -191,33 +151,22 @@ def test_an_installed_controller_is_swept_by_the_tool(site, tmp_path, monkeypatc
     header, *rows = (tmp_path / 'a.csv').read_text().splitlines()
     assert header.startswith('k_alpha_per_s,k_beta_per_s,')
     assert len(rows) == 4
-    ended = commands.run('sweep_gains', '--controller', 'unswept', '--csv', 'b.csv')
-    assert ended.code == 2
-    assert 'cannot be loaded: RuntimeError: no licence' in ended.err
 
 
 def test_gains_named_as_options_are_swept_under_another_name(monkeypatch, tmp_path):
-    odd = replace(
-        POLAR,
-        gains=(
-            Gain(name='grid', default=0.5, bounds=(0.0, 10.0)),
-            Gain(name='max_velocity', default=2.0, bounds=(0.0, 20.0)),
-            Gain(name='k_beta', default=-0.5),
-        ),
-    )
-    monkeypatch.setattr(
-        sweep_gains.CONTROLLERS, '_known', {**sweep_gains.CONTROLLERS.built_in, 'polar': odd}
-    )
+    grid = Gain(name='grid', default=0.5, bounds=(0.0, 10.0))
+    odd = replace(POLAR, gains=(grid, *POLAR.gains[1:]))
+    known = {**sweep_gains.CONTROLLERS.built_in, 'polar': odd}
+    monkeypatch.setattr(sweep_gains.CONTROLLERS, '_known', known)
     monkeypatch.chdir(tmp_path)
-    arguments = ('--controller', 'polar', '--gain-grid', '0.3', '0.6', '--gain-max_velocity', '1', '2')
-    more = ('--k_beta', '-0.3', '--max-velocity', '1', *SMALL)
-    ended = commands.run('sweep_gains', *arguments, *more)
+    arguments = ('--controller', 'polar', '--gain-grid', '0.3', '0.6', '--k_beta', '-0.3', *SMALL)
+    ended = commands.run('sweep_gains', *arguments)
     assert ended.code == 0
-    assert 'fastest: grid 0.6, max_velocity' in ended.out
+    assert 'fastest: grid 0.6' in ended.out
 
 
 def test_a_driven_point_is_swept_with_its_offset():
-    controller = control.Controller(
+    controller = Controller(
         name='point',
         law=lambda poses, goals, kp, kv, d: control.offset_point(poses, goals, kv, d),
         gains=(KP, KV, OFFSET),
@@ -235,8 +184,7 @@ def test_what_cannot_be_swept_is_refused():
     with pytest.raises(ValueError, match="two gains to be swept, but 'polar' has k_rho"):
         replace(setup, controller=replace(POLAR, gains=POLAR.gains[:1]))
     scalar = replace(POLAR, law=lambda pose, to, *_: (math.hypot(to[0] - pose[0], 0.0), 0.0))
-    words = r"'polar' must accept poses of shape \(\d+, 3\), but failed: "
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=r"'polar' must accept poses of shape \(\d+, 3\), but failed: "):
         sweep(replace(setup, controller=scalar))
     for bad in ('x', (1.0,), math.nan):
         with pytest.raises(ValueError, match='kp must be'):
@@ -248,27 +196,44 @@ def test_what_cannot_be_swept_is_refused():
 # --- A state
 
 
-def test_a_state_is_kept_during_a_goal_and_begins_anew_with_the_next(lockstep):
-    seen = []
+@pytest.fixture
+def clock():
+    """A law that counts the time, and what it was called with."""
 
-    def law(pose, to, kp, state, dt):
-        seen.append((float(state[0]), round(dt, 9)))
+    def law(pose, goal, kp, state, dt):
+        own.calls.append((float(state[0]), round(dt, 9)))
         return 0.0, 0.0, state + dt
 
-    clock = control.Controller(name='clock', law=law, gains=(KP,), state=(5.0,))
-    node = lockstep.add(GoToGoal(controller=clock))
+    own = SimpleNamespace(calls=[])
+    own.controller = Controller(name='clock', law=law, gains=(KP,), state=(5.0,))
+    return own
+
+
+def test_a_state_is_kept_during_a_goal_also_when_a_gain_changes_and_reset_for_the_next(lockstep, clock):
+    node = lockstep.add(GoToGoal(controller=clock.controller))
     lockstep.add(make(VirtualRobot))
     lockstep.publish('goal_pose', goal(1.0, 0.0))
     lockstep.run_for(0.1)
     assert change(node, kp=1.0).successful
     lockstep.run_for(0.1)
-    count = len(seen)
-    times = [dt for _, dt in seen]
+    count = len(clock.calls)
+    times = [dt for _, dt in clock.calls]
     assert times == [0.0] + [0.02] * (count - 1)
-    assert [state for state, _ in seen] == pytest.approx(5.0 + np.cumsum(times) - np.array(times))
+    states = [state for state, _ in clock.calls]
+    assert states == pytest.approx(5.0 + np.cumsum(times) - np.array(times))
     lockstep.publish('goal_pose', goal(2.0, 0.0))
     lockstep.run_for(0.1)
-    assert seen[count] == (5.0, 0.0)
+    assert clock.calls[count] == (5.0, 0.0)
+
+
+def test_a_state_is_reset_while_the_robot_stands(lockstep, clock):
+    """Or the whole gap would be one step of an integral."""
+    lockstep.add(GoToGoal(controller=clock.controller))
+    lockstep.publish('goal_pose', goal(5.0, 0.0))
+    for x, after in ((0.0, 0.1), (0.01, 2.1), (0.02, 0.01)):
+        lockstep.publish('odom', odometry(x, 0.0, 0.0))
+        lockstep.run_for(after)
+    assert clock.calls == [(5.0, 0.0), (5.0, 0.1), (5.0, 0.0)]
 
 
 def test_the_integral_removes_a_bias_in_node_and_batch_alike():
@@ -298,7 +263,7 @@ def test_an_equation_may_have_a_state_too_and_time_that_goes_back_is_no_time():
         (total,) = state
         return 0.0 * kp, kp * total, [total + dt]
 
-    own = control.Controller(name='equation', law=law, gains=(KP,), state=(1.0,))
+    own = Controller(name='equation', law=law, gains=(KP,), state=(1.0,))
     bound = own.bind(SimpleNamespace(kp=2.0))
     turned = []
     for bound.now in (0, 500_000_000, 10**9, 8 * 10**8, 10**9, 10**9):
@@ -310,12 +275,9 @@ def test_an_equation_may_have_a_state_too_and_time_that_goes_back_is_no_time():
 
 
 def test_an_invalid_state_is_named():
-    for result, words in (
-        ((0.0, 0.0), 'two finite numbers, and the state, shape (1,), got (0.0, 0.0)'),
-        ((0.0, 0.0, [1.0, 2.0]), 'and the state, shape (1,)'),
-        ((0.0, 0.0, [math.nan]), 'two finite numbers, and the state, shape (1,), got (0.0, 0.0, [nan])'),
-    ):
+    for result in ((0.0, 0.0), (0.0, 0.0, [1.0, 2.0]), (0.0, 0.0, [math.nan])):
         own = replace(INTEGRAL, law=lambda *_, result=result, **__: result)
+        words = f'two finite numbers, and the state, shape (1,), got {result}'
         with pytest.raises(LawError, match=re.escape(words)):
             own.bind(SimpleNamespace(kp=1.0, kv=1.0, ki=1.0))(np.zeros(3), np.ones(3))
 
@@ -323,6 +285,3 @@ def test_an_invalid_state_is_named():
 def test_a_gain_with_a_lower_bound_of_its_own_has_a_usual_range():
     assert Gain(name='a', default=0.0, above=-1.0).usual == (0.0, 100.0)
     assert Gain(name='a', default=1.0, bounds=(0.0, 100.0), above=0.5).usual == (1.0, 3.0)
-    for usual in ('x', None, 3.0, (2.0, 1.0)):
-        with pytest.raises(ValueError, match='usual must '):
-            Gain(name='a', default=1.0, usual=usual)

@@ -524,5 +524,5 @@ def test_bad_arguments_are_named_with_what_is_allowed(name, values, allowed):
 
 
 def test_targets_and_starts_that_do_not_fit_together_are_named():
-    with pytest.raises(ValueError, match='^target and q0 must have leading axes'):
+    with pytest.raises(ValueError, match=r'^target and q0 must have leading axes'):
         solve(**ARGUMENTS | {'target': np.zeros((4, 2)), 'q0': np.zeros((3, 2))})
