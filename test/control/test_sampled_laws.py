@@ -14,9 +14,8 @@ import pytest
 from support.lockstep_nodes import Controller, change
 from support.ros_messages import goal
 
-from diffdrive_jacobian.control import find_controller, go_to_pose
+from diffdrive_jacobian.control import find_controller
 from diffdrive_jacobian.control.goal_laws import by_shorter_turn
-from diffdrive_jacobian.simulation import closed_loops
 
 TOO_FAST = 'not below the odometry rate'
 
@@ -64,13 +63,6 @@ def test_by_shorter_turn_the_next_heading_is_the_same():
     slow = np.abs(omega) < 270.0
     assert np.array_equal(found[slow], omega[slow])
     assert by_shorter_turn(314.0, rate) == pytest.approx(314.0 - math.tau * rate)
-
-
-def test_weights_with_which_it_would_turn_once_per_sample_for_ever_arrive():
-    starts = np.random.default_rng(2).uniform([-3.0, -3.0, -3.0], 3.0, (10, 3))
-    starts[0] = 2.6080, 1.8942, 2.0064
-    h = np.array([[100.0], [215.0]])
-    assert closed_loops(go_to_pose, starts, [0.0, 0.0, 0.0], 5.0, 1.0, h).arrived.all()
 
 
 # --- The node
@@ -121,12 +113,3 @@ def test_the_node_makes_no_whole_turns(lockstep):
     wanted = 40.0 * math.atan2(1.0, -5.0)
     assert wanted > 7.0 / 8.0 * math.tau * 10.0
     assert omega == pytest.approx(math.remainder(wanted / 10.0, math.tau) * 10.0)
-
-
-def test_a_yaw_rate_that_is_limited_too_much_is_warned_about(lockstep, capfd):
-    node = Controller(lockstep).node
-    for limit, words in ((0.0, 'not at all'), (0.05, 'more than 60 s')):
-        assert change(node, angular__z__max_velocity=limit).successful
-        assert words in capfd.readouterr().err
-    assert change(node, angular__z__max_velocity=0.06).successful
-    assert 'yaw rate is limited' not in capfd.readouterr().err
