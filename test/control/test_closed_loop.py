@@ -17,15 +17,14 @@ from diffdrive_jacobian.control import (
     go_to_goal,
     go_to_pose,
     offset_point,
-    saturate,
 )
-from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loop, closed_loops, trajectories
 from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 
 R, L = 0.033, 0.16
+MS = 1_000_000
 FREE = VelocityLimits()
 LIMITS = VelocityLimits(min_v=-0.5, max_v=0.7, min_omega=-4.0, max_omega=3.0, max_wheel_speed=24.0)
 LAWS = {
@@ -40,23 +39,22 @@ def random_batch(seed, *shape):
     return np.random.default_rng(seed).uniform(-box, box, (2, *shape, 3))
 
 
-def alone(law, start, to, gains, arrival, limits=FREE, *, rate=50.0, duration=6.0, r=R, separation=L):
-    """Drive one robot in a scalar loop; return every outcome, and its poses."""
-    way, pose, poses, command = Waypoints(np.array([to])), start, [start], None
-    time, path, effort, beyond, step = math.nan, 0.0, 0.0, 0.0, 0
-    along = (to - start)[:2] / (math.dist(to[:2], start[:2]) or 1.0)
-    while True:
-        beyond = max(beyond, float(along @ (pose - to)[:2]))
-        way, command = way.follow(pose, lambda at, goal: law(at, np.array(goal), *gains), arrival, 3.0)
-        if command is None:
-            time = step / rate
-        if command is None or step == round(duration * rate):
-            return (command is None, time, path, effort, beyond, pose), poses
-        v, omega = saturate(*command, limits, r, separation)
-        path += abs(v) / rate
-        effort += sum(wheel**2 for wheel in body_to_wheel(v, omega, r, separation)) / rate
-        pose, step = se2.integrate(pose, [v, omega], 1.0 / rate), step + 1
-        poses.append(pose)
+def alone(law, start, to, gains, arrival, actuators, steps):
+    """Drive a robot of the nodes at 25 Hz; return its poses, and the time of its arrival (s)."""
+    model = RobotModel(limits=LIMITS, actuators=actuators)
+    robot, way = Robot(model=model, stamp=0, pose=start), Waypoints(to[np.newaxis])
+    poses, time, command = [], math.nan, None
+
+    def bound(pose, goal):
+        return law(pose, np.array(goal), *gains)
+
+    for step in range(steps):
+        poses.append(robot.pose)
+        if math.isnan(time):
+            way, command = way.follow(robot.pose, bound, arrival, 3.0, robot.twist)
+            time = math.nan if command else step / 25.0
+        robot = robot.commanded(command or (0.0, 0.0), robot.stamp).at(robot.stamp + 40 * MS)
+    return np.array(poses), time
 
 
 def assert_same(found, expected):
@@ -68,28 +66,47 @@ def row(outcomes, index):
     return type(outcomes)(*(field[index] for field in outcomes))
 
 
-@pytest.mark.parametrize(
-    ('name', 'limits'), [('go_to_goal', FREE), ('offset_point', LIMITS), ('pose', LIMITS)]
+SLOW = AccelerationLimits(
+    v=AxisLimits(
+        max_acceleration=1.0,
+        max_deceleration=-1.5,
+        max_acceleration_reverse=-0.7,
+        max_deceleration_reverse=1.2,
+    ),
+    omega=AxisLimits(max_acceleration=12.0, max_deceleration=-16.0),
 )
-def test_a_batch_is_each_of_its_robots_in_a_scalar_loop(name, limits):
+WHEELS = AccelerationLimits(max_wheel_acceleration=60.0)
+
+
+@pytest.mark.parametrize('name', LAWS)
+@pytest.mark.parametrize(
+    'actuators',
+    [
+        Actuators(),
+        Actuators(acceleration=SLOW),
+        Actuators(acceleration=WHEELS, delay=40 * MS),
+        Actuators(acceleration=SLOW, lag=0.02, delay=33 * MS),
+    ],
+    ids=['ideal', 'acceleration', 'delay', 'lag'],
+)
+def test_a_batch_is_each_of_its_robots_alone(name, actuators):
     law, gains = LAWS[name]
-    use_heading = name == 'pose'
-    starts, targets = random_batch(1, 3)
+    starts, targets = 0.5 * random_batch(7, 3)
     targets[0] = starts[0]
-    arrival = Arrival(use_heading=use_heading, offset=gains[1] if name == 'offset_point' else 0.0)
-    how = {'duration': 4.0, 'arrival': arrival, 'limits': limits, 'rate': 25.0}
+    arrival = Arrival(
+        use_heading=name == 'pose',
+        offset=gains[1] if name == 'offset_point' else 0.0,
+        trans_stopped_velocity=0.01,
+        rot_stopped_velocity=0.05,
+    )
+    how = {'duration': 4.0, 'arrival': arrival, 'limits': LIMITS, 'rate': 25.0, 'actuators': actuators}
     gone = trajectories(law, starts, targets, *gains, **how)
     assert_same(closed_loops(law, starts, targets, *gains, **how), gone.outcomes)
-    goals = targets if use_heading else targets[:, :2]
-    assert_same(closed_loops(CONTROLLERS.built_in[name], starts, goals, *gains, **how), gone.outcomes)
     assert_allclose(gone.times, np.arange(len(gone.poses)) / 25.0, rtol=1e-12)
     for index, (start, to) in enumerate(zip(starts, targets, strict=True)):
-        expected, poses = alone(law, start, to, gains, arrival, limits, duration=4.0, rate=25.0)
-        assert_same(row(gone.outcomes, index), expected)
-        assert_allclose(gone.poses[: len(poses), index], poses, atol=1e-9)
-        # Who has arrived stands still.
-        assert np.all(gone.poses[len(poses) - 1 :, index] == gone.poses[-1, index])
-        assert not gone.twists[len(poses) - 1 :, index].any()
+        poses, time = alone(law, start, to, gains, arrival, actuators, len(gone.poses))
+        assert_allclose(gone.outcomes.time[index], time, rtol=1e-12)
+        assert_allclose(se2.log(se2.compose(se2.inverse(poses), gone.poses[:, index])), 0.0, atol=2e-9)
     assert gone.outcomes.arrived.any()
     # A single robot is a batch without axes.
     single = closed_loops(law, starts[1], targets[1], *gains, **how)
@@ -97,26 +114,35 @@ def test_a_batch_is_each_of_its_robots_in_a_scalar_loop(name, limits):
     assert_same(single, row(gone.outcomes, 1))
 
 
+def test_outcomes_are_those_of_the_trajectory():
+    starts, targets = random_batch(1, 3)
+    found = trajectories(go_to_pose, starts, targets, 6.0, 1.5, arrival=Arrival(use_heading=True))
+    (v, omega), outcomes = np.moveaxis(found.twists, -1, 0), found.outcomes
+    assert_allclose(outcomes.path_length, np.abs(v).sum(axis=0) / 50.0)
+    wheels = np.stack(body_to_wheel(v, omega, R, L))
+    assert_allclose(outcomes.control_cost, (wheels**2).sum(axis=(0, 1)) / 50.0)
+    along = (targets - starts)[:, :2] / np.linalg.norm((targets - starts)[:, :2], axis=-1)[:, np.newaxis]
+    beyond = ((found.poses - targets)[..., :2] * along).sum(axis=-1).max(axis=0)
+    assert_allclose(outcomes.overshoot, np.maximum(beyond, 0.0), atol=1e-12)
+    assert np.array_equal(outcomes.pose, found.poses[-1])
+
+
 def test_starts_gains_robots_limits_and_offsets_broadcast():
     starts, targets = random_batch(5, 2, 1, 1, 1)
     k, d = np.array([[[0.8]], [[2.0]]]), np.array([[0.1], [-0.3]])
     r, separation, max_v = np.array([0.02, 0.05]), np.array([0.2, 0.1]), np.array([[0.3], [np.inf]])
     min_omega = np.array([[[[-0.5]]], [[[-np.inf]]]])
-    limits = VelocityLimits(max_v=max_v, min_omega=min_omega, max_wheel_speed=9.0)
-    robots = {'arrival': Arrival(offset=d), 'limits': limits, 'r': r, 'L': separation}
-    how = {'duration': 3.0, 'rate': 10.0}
-    found = closed_loops(offset_point, starts, targets[..., :2], k, d, **robots, **how)
+
+    def drive(start, goal, k, d, r, L, max_v, min_omega):
+        limits = VelocityLimits(max_v=max_v, min_omega=min_omega, max_wheel_speed=9.0)
+        how = {'arrival': Arrival(offset=d), 'limits': limits, 'duration': 3.0, 'rate': 10.0}
+        return closed_loops(offset_point, start, goal[..., :2], k, d, r=r, L=L, **how)
+
+    found = drive(starts, targets, k, d, r, separation, max_v, min_omega)
     assert found.time.shape == (2, 2, 2, 2)
     for i, j, m, n in np.ndindex(2, 2, 2, 2):
-        one, _ = alone(
-            lambda at, to, *gains: offset_point(at, to[:2], *gains),
-            *(starts[i, 0, 0, 0], targets[i, 0, 0, 0], (k[j, 0, 0], d[m, 0])),
-            Arrival(offset=float(d[m, 0])),
-            VelocityLimits(max_v=max_v[m, 0], min_omega=min_omega[i, 0, 0, 0], max_wheel_speed=9.0),
-            r=r[n],
-            separation=separation[n],
-            **how,
-        )
+        place = starts[i, 0, 0, 0], targets[i, 0, 0, 0], k[j, 0, 0], float(d[m, 0])
+        one = drive(*place, r[n], separation[n], float(max_v[m, 0]), float(min_omega[i, 0, 0, 0]))
         assert_same(row(found, (i, j, m, n)), one)
     assert len(np.unique(found.control_cost)) > 10
 
@@ -273,60 +299,7 @@ def test_an_unknown_option_is_a_type_error():
         trajectories('go_to_goal', [0.0, 0.0, 0.0], [1.0, 0.0], rat=3.0)
 
 
-# --- Robots that take time
-
-SLOW = AccelerationLimits(
-    v=AxisLimits(
-        max_acceleration=1.0,
-        max_deceleration=-1.5,
-        max_acceleration_reverse=-0.7,
-        max_deceleration_reverse=1.2,
-    ),
-    omega=AxisLimits(max_acceleration=12.0, max_deceleration=-16.0),
-)
-MS = 1_000_000
-FOLLOWING = {
-    'pose': Actuators(acceleration=SLOW),
-    'offset_point': Actuators(
-        acceleration=AccelerationLimits(max_wheel_acceleration=60.0), delay=40 * MS
-    ),
-    'go_to_goal': Actuators(acceleration=SLOW, lag=0.02, delay=33 * MS),
-}
-
-
-@pytest.mark.parametrize('name', FOLLOWING)
-def test_robots_that_take_time_drive_as_one_of_the_nodes_alone(name):
-    law, gains = LAWS[name]
-    starts, targets = 0.15 * random_batch(7, 2)
-    arrival = Arrival(
-        use_heading=name == 'pose',
-        offset=gains[1] if name == 'offset_point' else 0.0,
-        trans_stopped_velocity=0.01,
-        rot_stopped_velocity=0.05,
-    )
-    model = RobotModel(limits=LIMITS, actuators=FOLLOWING[name])
-    many = {'duration': 1.6, 'arrival': arrival, 'limits': LIMITS, 'actuators': FOLLOWING[name]}
-    gone = trajectories(law, starts, targets, *gains, **many)
-    assert_same(closed_loops(law, starts, targets, *gains, **many), gone.outcomes)
-
-    for index, (start, to) in enumerate(zip(starts, targets, strict=True)):
-        robot, way, arrived = Robot(model=model, stamp=0, pose=start), Waypoints(to[np.newaxis]), None
-        for time, pose in zip(gone.times, gone.poses[:, index], strict=True):
-            assert np.abs(se2.log(se2.compose(se2.inverse(pose), robot.pose))).max() < 2e-9
-            if arrived is None:
-                way, command = way.follow(
-                    robot.pose,
-                    lambda at, goal: law(at, np.array(goal), *gains),
-                    arrival,
-                    3.0,
-                    robot.twist,
-                )
-                arrived = time if command is None else None
-            command = command or (0.0, 0.0)
-            robot = robot.commanded(command, robot.stamp).at(robot.stamp + 20 * MS)
-        expected = math.nan if arrived is None else arrived
-        assert gone.outcomes.time[index] == pytest.approx(expected, nan_ok=True)
-    assert gone.outcomes.arrived.any()
+# --- Commands that act late
 
 
 def test_a_command_that_acts_after_the_duration_does_not_move_the_robot():
