@@ -12,7 +12,6 @@ from diffdrive_jacobian.control import (
     Path,
     PathController,
     VelocityLimits,
-    figure_eight_path,
     find_controller,
     line_path,
 )
@@ -206,11 +205,9 @@ def test_the_look_ahead_point_is_beyond_the_end_of_an_open_path():
 
 
 def test_settings_do_not_change_the_look_ahead_of_the_law():
-    path = figure_eight_path(1.0)
-    alone = follow_path('pure_pursuit', path, start=(0.0, 0.1, 0.0))
-    same = follow_path('pure_pursuit', path, start=(0.0, 0.1, 0.0), settings=PathSettings())
+    alone = follow_path('pure_pursuit', eight(), start=(0.0, 0.1, 0.0))
+    same = follow_path('pure_pursuit', eight(), start=(0.0, 0.1, 0.0), settings=PathSettings())
     np.testing.assert_array_equal(same.poses, alone.poses)
-    assert np.abs(alone.errors[:, 1]).max() < 0.11
 
 
 def test_invalid_arguments_are_named():
