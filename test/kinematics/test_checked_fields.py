@@ -22,7 +22,6 @@ from diffdrive_jacobian.numerics.checks import (
     Names,
     NotNegative,
     Positive,
-    Probability,
     between,
     boolean,
     instance,
@@ -48,9 +47,7 @@ class Several(Base):
     _: KW_ONLY
     count: Count = 2
     goals: Names = ('a',)
-    kind: Annotated[str, one_of('wheel', 'arm')] = 'arm'
     pairs: Annotated[int | None, optional(partial(integer, low=4))] = None
-    share: Probability = 0.5
     limits: VelocityLimits | None = None
     exact: bool = False
     free: object = None
@@ -62,9 +59,9 @@ class Slotted(Checked):
 
 
 def test_fields_are_converted():
-    value = Several('odom', np.float32(0.5), count=np.int64(3), goals=['b', 'c'], pairs=4, share=1)
-    assert value == Several('odom', 0.5, count=3, goals=('b', 'c'), pairs=4, share=1.0)
-    assert [type(one) for one in (value.speed, value.count, value.share)] == [float, int, float]
+    value = Several('odom', np.float32(0.5), count=np.int64(3), goals=['b', 'c'], pairs=4)
+    assert value == Several('odom', 0.5, count=3, goals=('b', 'c'), pairs=4)
+    assert [type(value.speed), type(value.count)] == [float, int]
 
 
 @pytest.mark.parametrize(
@@ -74,15 +71,11 @@ def test_fields_are_converted():
         ({'node': None}, 'node must be a string, got None'),
         ({'speed': 0}, 'speed must be positive and finite, got 0'),
         ({'speed': '1'}, "speed must be a number, got '1'"),
-        ({'speed': True}, 'speed must be a number, got True'),
-        ({'speed': [1.0]}, r'speed must be a number, got \[1.0\]'),
         ({'speed': np.ones(1)}, r'speed must be a single number, got shape \(1,\)'),
         ({'speed': 10**5000}, 'speed must be finite, got an object of class int'),
         ({'count': 1.0}, 'count must be an integer of at least 1, got 1.0'),
-        ({'count': True}, 'count must be an integer of at least 1, got True'),
         ({'count': -(10**5000)}, 'count must be an integer of at least 1, got an object of class int'),
         ({'goals': 'odom'}, "goals must be a list or tuple of names, got 'odom'"),
-        ({'goals': 3}, 'goals must be a list or tuple of names, got 3'),
         ({'goals': ['odom', '']}, r"goals must be a list or tuple of names, got \['odom', ''\]"),
         ({'limits': 1.0}, 'limits must be of class VelocityLimits, got 1.0'),
         ({'exact': 1}, 'exact must be True or False, got 1'),
@@ -120,9 +113,7 @@ def test_a_misspelt_type_is_a_mistake():
         (between(0.0, 1.0), (), (True, '1'), 'a number'),
         (between(0.0, 1.0, above=0.0, unit='m'), (1e-300, 1), (0.0, 2), 'in (0, 1] m'),
         (between(0.1), (0.1, 1e300), (np.inf,), 'finite and at least 0.1'),
-        (between(0.1), (), (10**5000,), 'finite'),
         (between(0, 2**63 - 1, above=3), (4,), (3,), 'in (3, 9223372036854775807]'),
-        (between(-1e6, 1e6), (), (2e6,), 'in [-1e+06, 1e+06]'),
         (boolean, (True, False), (1,), 'True or False'),
         (mapping, ({},), ([],), 'a map'),
         (sequence, ([],), ({},), 'a list'),
@@ -138,18 +129,6 @@ def test_checks_that_need_no_numpy(check, valid, invalid, allowed):
         got = 'an object of class int' if value == 10**5000 else repr(value)
         with pytest.raises(ValueError, match=f'^{re.escape(f"x must be {allowed}, got {got}")}$'):
             check('x', value)
-
-
-@pytest.mark.parametrize(
-    'check',
-    [
-        *(checks.finite, checks.positive, checks.positive_or_infinite, checks.not_negative),
-        *(checks.not_negative_or_infinite, checks.offset, checks.semidefinite, checks.anything),
-    ],
-)
-def test_a_check_returns_the_value(check):
-    value = np.ones((3, 3)) + np.eye(3)
-    assert check('x', value) is value
 
 
 def test_a_covariance_in_a_batch_is_compared_with_its_own_size():
@@ -177,9 +156,7 @@ def test_values_with_arrays_are_equal_where_their_entries_are(cls, name):
     assert (number, hash(number)) == (array, hash(array))
 
 
-def test_models_are_compared_by_their_limits_which_are_those_of_one_robot():
-    assert RobotModel(limits=VelocityLimits(max_v=1.0)) == RobotModel(limits=VelocityLimits(max_v=1.0))
-    assert RobotModel(limits=VelocityLimits(max_v=1.0)) != RobotModel()
+def test_the_limits_of_a_model_are_those_of_one_robot():
     with pytest.raises(ValueError, match=r'^limits must be numbers for one robot'):
         RobotModel(limits=VelocityLimits(max_v=[1.0, 2.0]))
 
@@ -205,7 +182,7 @@ def test_a_value_does_not_change_with_the_array_it_was_given(make, name):
 
 
 def test_a_read_only_array_is_copied_as_well():
-    """Who owns it may write to it later."""
+    """Its owner may write to it later."""
     given = np.array([1.0, 0.5])
     given.setflags(write=False)
     arm = PlanarArm(given)
@@ -214,15 +191,8 @@ def test_a_read_only_array_is_copied_as_well():
     assert arm.lengths.tolist() == [1.0, 0.5]
 
 
-class Scalar:
-    """A number of another library."""
-
-    def __array__(self, dtype=None, copy=None):
-        return np.array(0.5)
-
-
-def test_numbers_of_other_libraries_are_numbers_and_durations_are_none():
-    assert Slotted(y=Scalar()).y == Slotted(y=np.array(0.5)).y == 0.5
+def test_arrays_without_axes_are_numbers_and_durations_are_none():
+    assert Slotted(y=np.array(0.5)).y == 0.5
     assert RobotModel(command_timeout=np.array(5)).command_timeout == 5
     for bad in (np.timedelta64(3, 'ns'), np.array(True), np.array('1')):
         with pytest.raises(ValueError, match='y must be a number'):
