@@ -58,12 +58,6 @@ def test_rolling_of_both_wheels_is_the_chain():
     A_q, A_w = dd.rolling_constraints(THETA, R, L)
     close(A_q @ CHAIN, A_w, R)
     close(np.linalg.solve(A_q, A_w), CHAIN, np.linalg.cond(A_q) * R)
-    # Row by row, with the velocities of the wheels' centres, which stand L/2 beside the axle's.
-    q_dot = times(CHAIN, SPEEDS)
-    forward = q_dot[:, 0] * np.cos(THETA) + q_dot[:, 1] * np.sin(THETA)
-    centres = np.stack([forward + L / 2.0 * q_dot[:, 2], forward - L / 2.0 * q_dot[:, 2]], axis=-1)
-    close(times(A_q, q_dot), np.insert(centres, 0, 0.0, axis=1), 100.0 * R)
-    close(centres, R[:, np.newaxis] * SPEEDS, 100.0 * R)
 
 
 def test_the_wheel_centres_roll_forward_and_the_axle_centre_is_half_way():
@@ -73,21 +67,15 @@ def test_the_wheel_centres_roll_forward_and_the_axle_centre_is_half_way():
     close(right - left, L[:, np.newaxis] * A[:, 0, :2], 10.0 + L)
     velocities = dd.wheel_centre_velocities(THETA, times(CHAIN, SPEEDS), L)
     close(times(velocities, S[:, :2, 0]), R[:, np.newaxis] * SPEEDS, 1e3 * R)
-    close(times(velocities, A[:, 0, :2]), 0.0, 1e3 * R)
 
 
 def test_the_velocities_of_the_wheel_centres_are_those_of_a_rigid_body():
-    """Also of a robot that slips: by differences of the centres, and from one wheel to the other."""
+    """Also of a robot that slips: by differences of the centres."""
     q_dot = RNG.uniform(-100.0, 100.0, (COUNT, 3))
     poses = np.column_stack([np.zeros((COUNT, 2)), THETA])
     velocities = dd.wheel_centre_velocities(THETA, q_dot, L)
     ahead, behind = (dd.wheel_centres(poses + sign * 1e-6 * q_dot, L) for sign in (1, -1))
     np.testing.assert_allclose(velocities, (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-4)
-    in_space = [(0, 0), (0, 0), (0, 1)]
-    centres, velocities = (np.pad(rows, in_space) for rows in (dd.wheel_centres(poses, L), velocities))
-    turning = q_dot * [0.0, 0.0, 1.0]
-    from_left = rigid_body.point_velocity(velocities[:, 1], turning, centres[:, 0] - centres[:, 1])
-    close(from_left, velocities[:, 0], 1e3 * (1.0 + L))
 
 
 def test_the_velocity_of_a_point_of_a_rigid_body():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.control import resolved_rate
-from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 from diffdrive_jacobian.kinematics.spatial import (
@@ -87,15 +86,6 @@ def test_the_jacobian_is_the_derivative_of_the_pose(arm):
 
 
 @every_arm
-def test_a_batch_gives_what_each_configuration_gives(arm):
-    q = configurations(arm).reshape(5, 10, -1)
-    for frame in ('base', 'end'):
-        J = arm.jacobian(q, frame)
-        assert J.shape == (5, 10, 6, arm.joints)
-        np.testing.assert_allclose(J[3, 7], arm.jacobian(q[3, 7], frame), rtol=0.0, atol=1e-14)
-
-
-@every_arm
 def test_the_jacobians_of_both_frames_are_adjoint(arm):
     """Of base and end effector: the same velocity, seen from either."""
     q = configurations(arm)
@@ -111,21 +101,11 @@ def test_the_jacobians_of_both_frames_are_adjoint(arm):
 
 
 def test_an_arm_in_the_plane_is_a_planar_arm():
-    lengths = [0.5, 0.4, 0.3]
-    planar, spatial = PlanarArm(lengths), SpatialArm(a=lengths, alpha=0.0, d=0.0)
+    """That its Jacobian is too, test_jacobians.py shows."""
+    planar, spatial = PlanarArm([0.5, 0.4, 0.3]), SpatialArm(a=[0.5, 0.4, 0.3], alpha=0.0, d=0.0)
     q = configurations(planar)
-    np.testing.assert_allclose(
-        spatial.forward_kinematics(q), se2.homogeneous_3d(planar.forward_kinematics(q)), atol=1e-15
-    )
-    J = spatial.jacobian(q)
-    np.testing.assert_allclose(J[:, [0, 1, 5]], planar.jacobian(q, heading=True), rtol=0.0, atol=1e-15)
-    assert not J[:, 2:5].any()
-
-
-def test_a_joint_that_slides_moves_along_its_axis_and_turns_nothing():
-    J = STANFORD.jacobian(configurations(STANFORD))
-    assert not J[:, 3:, 2].any()
-    np.testing.assert_allclose(np.linalg.norm(J[:, :3, 2], axis=-1), 1.0)
+    expected = se2.homogeneous_3d(planar.forward_kinematics(q))
+    np.testing.assert_allclose(spatial.forward_kinematics(q), expected, atol=1e-15)
 
 
 @every_arm
@@ -153,14 +133,6 @@ def test_the_elbow_moves_while_the_hand_stays():
     assert np.linalg.norm(IIWA.joint_positions(q)[3] - elbow) > 0.15
 
 
-def test_a_task_without_a_rotation_leaves_the_hand_to_turn():
-    q = np.array([0.2, -1.0, 1.2, -0.5, 0.7, 0.1])
-    J, nu = UR5.jacobian(q), np.array([0.1, 0.0, 0.05, 0.0, 0.0, 0.0])
-    moved = J @ iv.damped_least_squares(*iv.masked_task(J, nu, [1, 1, 1, 0, 0, 0]), 0.0)
-    np.testing.assert_allclose(moved[:3], nu[:3], rtol=0.0, atol=1e-12)
-    assert np.linalg.norm(moved[3:]) > 0.01
-
-
 # --- Inverse kinematics
 
 
@@ -178,8 +150,8 @@ def test_reachable_poses_are_reached_within_the_limits(arm):
 
 
 def test_the_limits_of_an_arm_hold_unless_others_are_given():
-    target = PANDA.forward_kinematics(np.array([0.1, 0.3, -0.2, -1.5, 0.2, 1.8, 0.4]))
-    start = np.array([0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0])
+    target = PANDA.forward_kinematics([0.1, 0.3, -0.2, -1.5, 0.2, 1.8, 0.4])
+    start = [0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]
     result = PANDA.inverse_kinematics(target, start)
     assert result.converged
     lower, upper = PANDA.limits
@@ -188,20 +160,12 @@ def test_the_limits_of_an_arm_hold_unless_others_are_given():
     assert not PANDA.inverse_kinematics(target, start, limits=narrow, restarts=0).converged
 
 
-def test_a_position_alone_is_a_mask():
-    q = np.array([0.2, -1.0, 1.2, -0.5, 0.7, 0.1])
-    target = UR5.forward_kinematics(q)
-    target[:3, :3] = np.eye(3)
-    result = UR5.inverse_kinematics(target, q + 0.3, mask=[1, 1, 1, 0, 0, 0])
-    assert result.converged
-    np.testing.assert_allclose(UR5.forward_kinematics(result.q)[:3, 3], target[:3, 3], atol=1e-6)
-
-
 MASKS = {
     'rotations about one axis': [1, 1, 1, 0, 0, 1],
     'unequal weights': [1, 1, 1, 0.1, 1, 10],
     'two rotations': [0, 0, 0, 1, 1, 0],
     'a direction': [1, 1, 1, 1, 1, 0],
+    'a position': [1, 1, 1, 0, 0, 0],
 }
 
 
@@ -231,100 +195,65 @@ def test_one_angle_is_reached_from_a_start_where_another_error_would_stop_the_se
     assert UR5.inverse_kinematics(target, q0, mask=[0, 0, 0, 0, 0, 1], restarts=0).converged
 
 
-def test_a_drill_may_turn_about_its_own_axis():
-    rng = np.random.default_rng(3)
-    lower, upper = IIWA.limits
-    q, q0 = rng.uniform(lower, upper, (2, 7))
-    target = IIWA.forward_kinematics(q)
-    found = IIWA.inverse_kinematics(target, q0, 'end', mask=[1, 1, 1, 1, 1, 0])
-    reached = IIWA.forward_kinematics(found.q)
-    np.testing.assert_allclose(reached[:3, 2:], target[:3, 2:], rtol=0.0, atol=2e-6)
-    assert np.abs(reached[:3, :2] - target[:3, :2]).max() > 0.1
-    with pytest.raises(ValueError, match="frame must be one of 'base', 'end', got 'tool'"):
-        IIWA.inverse_kinematics(target, q0, 'tool')
-
-
 # --- Pose vectors
 
 
-def test_the_difference_of_poses_is_the_displacement_in_the_axes_of_the_base():
+def test_differences_of_pose_vectors_are_displacements_of_poses():
+    """In the axes of the base or of the end effector."""
     T, T_desired = (UR5.forward_kinematics(configurations(UR5) + by) for by in (0.0, 0.5))
-    delta = spatial_displacement(T, T_desired).reshape(50, 2, 3)
-    in_base = np.einsum('kij,kpj->kpi', T[:, :3, :3], delta).reshape(50, 6)
-    found = pose_vector_difference(pose_vector(T_desired), pose_vector(T))
-    np.testing.assert_allclose(found, in_base, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(found[3], pose_vector_difference(*map(pose_vector, (T_desired[3], T[3]))))
-
-
-def test_the_displacement_of_pose_vectors_is_that_of_the_poses():
-    T, T_desired = (UR5.forward_kinematics(configurations(UR5) + by) for by in (0.0, 0.5))
-    found = pose_vector_displacement(pose_vector(T_desired), pose_vector(T))
-    np.testing.assert_allclose(found, spatial_displacement(T, T_desired), rtol=0.0, atol=1e-12)
-    one = pose_vector_displacement(pose_vector(T_desired[3]), pose_vector(T[3]))
-    np.testing.assert_allclose(one, found[3], rtol=0.0, atol=1e-14)
+    delta = spatial_displacement(T, T_desired)
+    in_base = np.einsum('kij,kpj->kpi', T[:, :3, :3], delta.reshape(50, 2, 3)).reshape(50, 6)
+    vectors = pose_vector(T_desired), pose_vector(T)
+    np.testing.assert_allclose(pose_vector_difference(*vectors), in_base, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(pose_vector_displacement(*vectors), delta, rtol=0.0, atol=1e-12)
 
 
 # --- Arguments
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'words'),
+    ('changes', 'words'),
     [
-        (
-            {'a': [1.0, 2.0], 'alpha': [0.0], 'd': 0.0},
-            r'must have one shape \(n,\), with n >= 1, got a \(2,\), alpha \(1,\)',
-        ),
-        ({'a': 0.0, 'alpha': 0.0, 'd': 0.0}, r'must have one shape \(n,\), with n >= 1, got a \(\)'),
-        ({'a': [[1.0]], 'alpha': 0.0, 'd': 0.0}, 'must have one shape'),
-        ({'a': [np.nan], 'alpha': 0.0, 'd': 0.0}, 'a must be finite'),
-        ({'a': ['x'], 'alpha': 0.0, 'd': 0.0}, 'a must'),
-        (
-            {'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'prismatic': (1,)},
-            'prismatic must be an integer from 0 to 0',
-        ),
-        (
-            {'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': (1.0, -1.0)},
-            'limits must be .* lower <= upper',
-        ),
-        (
-            {'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': (np.inf, np.inf)},
-            'limits must be .* got .*inf',
-        ),
-        ({'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': [[-1.0, 1.0]]}, 'limits must be a pair'),
-        ({'a': [1.0, 1.0], 'alpha': 0.0, 'd': 0.0, 'limits': ([1.0], 2.0)}, r'shape \(\) or \(2,\)'),
-        ({'a': [1.0], 'alpha': 0.0, 'd': 0.0, 'limits': 1.0}, 'limits must be a pair'),
-        ({'a': [], 'alpha': [], 'd': []}, r'one shape \(n,\), with n >= 1'),
+        ({'a': [1.0, 2.0]}, r'must have one shape \(n,\), with n >= 1, got a \(2,\), alpha \(1,\)'),
+        ({'alpha': 0.0, 'a': 0.0}, r'must have one shape \(n,\), with n >= 1, got a \(\)'),
+        ({'a': [[1.0]]}, 'must have one shape'),
+        ({'a': [], 'alpha': []}, 'must have one shape'),
+        ({'a': [np.nan]}, 'a must be finite'),
+        ({'prismatic': (1,)}, 'prismatic must be an integer from 0 to 0'),
+        ({'limits': (1.0, -1.0)}, 'limits must be .* lower <= upper'),
+        ({'limits': (np.inf, np.inf)}, 'limits must be .* got .*inf'),
+        ({'limits': [[-1.0, 1.0]]}, 'limits must be a pair'),
+        ({'limits': ([1.0, 1.0], 2.0)}, r'shape \(\) or \(1,\)'),
+        ({'limits': 1.0}, 'limits must be a pair'),
     ],
 )
-def test_wrong_parameters_are_named(arguments, words):
+def test_wrong_parameters_are_named(changes, words):
     with pytest.raises(ValueError, match=words):
-        SpatialArm(**arguments)
+        SpatialArm(**{'a': [1.0], 'alpha': [0.0], 'd': 0.0} | changes)
 
 
-def test_wrong_arguments_are_named():
-    for call, words in (
+@pytest.mark.parametrize(
+    ('call', 'words'),
+    [
         (lambda: UR5.jacobian(np.zeros(6), 'tool'), "frame must be one of 'base', 'end', got 'tool'"),
         (lambda: UR5.jacobian(np.zeros(7)), r'q must have shape \(..., 6\)'),
-        (lambda: UR5.forward_kinematics([np.inf] * 6), 'q must be finite'),
         (lambda: UR5.joint_torques(np.zeros(6), np.zeros(3)), r'wrench must have shape \(..., 6\)'),
         (lambda: UR5.inverse_kinematics(np.ones((4, 4)), np.zeros(6)), 'target must be'),
-        (
-            lambda: UR5.inverse_kinematics(np.eye(3), np.zeros(6)),
-            r'target must have shape \(..., 4, 4\)',
-        ),
+        (lambda: UR5.inverse_kinematics(np.eye(3), np.zeros(6)), r'target must have .* 4, 4\)'),
         (lambda: UR5.inverse_kinematics(np.eye(4), np.zeros(5)), r'q0 must have shape \(..., 6\)'),
-    ):
-        with pytest.raises(ValueError, match=words):
-            call()
-    with pytest.raises(ValueError, match='read-only'):
-        UR5.a[0] = 1.0
+        (lambda: UR5.inverse_kinematics(np.eye(4), np.zeros(6), 'tool'), 'frame must be one of'),
+    ],
+)
+def test_wrong_arguments_are_named(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
 
 
-def test_arms_are_compared_and_copied_by_their_parameters():
+def test_arms_are_immutable_and_compared_and_copied_by_their_parameters():
     assert dataclasses.replace(UR5) == UR5 != dataclasses.replace(UR5, d=0.1)
     assert hash(dataclasses.replace(UR5)) == hash(UR5)
     assert dataclasses.replace(UR5, prismatic=(2,)).slides.tolist() == [0, 0, 1, 0, 0, 0]
-    free = dataclasses.replace(UR5, limits=None)
-    assert free.limits is None
-    assert free != UR5
+    assert dataclasses.replace(UR5, limits=None) != UR5
+    with pytest.raises(ValueError, match='read-only'):
+        UR5.a[0] = 1.0
     assert PlanarArm([1.0, 0.5]) == PlanarArm(np.array([1.0, 0.5])) != PlanarArm([1.0, 0.6])
