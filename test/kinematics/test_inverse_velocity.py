@@ -68,29 +68,32 @@ def test_the_adjugate_never_returns_what_is_rounding_error_only():
     J, _, s, _ = decomposed(np.random.default_rng(1), 2, 2, least=1e-16)
     J[::5] = J[::5, :1] * J[::5, :, :1]  # rank 1
     s[::5, 1:] = 0.0
-    inverses = np.zeros_like(J)
-    for matrix, inverse in zip(J, inverses, strict=True):
+    for matrix, (first, second) in zip(J, s, strict=True):
+        relative = min(first, second) / max(first, second, 1e-300)
         with contextlib.suppress(np.linalg.LinAlgError):
-            inverse[:] = iv.adjugate_inverse(matrix)
-    returned, relative = inverses.any(axis=(1, 2)), s.min(axis=-1) / np.maximum(s.max(axis=-1), 1e-300)
-    assert np.all(relative[returned] > 1e-16)
-    which = returned & (relative > 1e-12)
-    right = np.linalg.inv(J[which])
-    assert np.all(size(inverses[which] - right) <= 0.01 * size(right))
+            inverse = iv.adjugate_inverse(matrix)
+            assert relative > 1e-16
+            right = np.linalg.inv(matrix)
+            assert relative < 1e-12 or size(inverse - right) <= 0.01 * size(right)
 
 
-@pytest.mark.parametrize('scale', [1e-310, 1e-161, 1e-140, 1e150, 1e200])
-def test_the_adjugate_inverts_whatever_the_units_or_raises_an_error(scale):
+@pytest.mark.parametrize(
+    ('scale', 'error'),
+    [
+        (1e-161, 'must not be singular'),
+        (1e-140, None),
+        (1e150, None),
+        (1e200, 'J must give a finite result, but it overflows'),
+    ],
+)
+def test_the_adjugate_inverts_whatever_the_units_or_raises_an_error(scale, error):
     J = np.array([[1.0, 1.0], [0.5, 2.0]])
-    if scale < 1e-145:
-        with pytest.raises(np.linalg.LinAlgError, match='must not be singular'):
-            iv.adjugate_inverse(J * scale)
-    elif scale > 1e154:
-        with pytest.raises(ValueError, match='J must give a finite result, but it overflows'):
-            iv.adjugate_inverse(J * scale)
-    else:
+    if error is None:
         inverse = iv.adjugate_inverse(J * scale) * scale
         np.testing.assert_allclose(inverse, np.linalg.inv(J), rtol=1e-12)
+    else:
+        with pytest.raises((ValueError, np.linalg.LinAlgError), match=error):
+            iv.adjugate_inverse(J * scale)
 
 
 # --- Inverses and the null space
@@ -201,20 +204,17 @@ def test_a_singular_direction_is_an_axis_of_length_zero_and_carries_every_force(
     np.testing.assert_allclose(np.abs(U[:, 1]), [np.cos(0.3), np.sin(0.3)])
     assert s[1] == iv.smallest_singular_value(J) == 0.0
     assert iv.force_ellipsoid(J).semi_axes[1] == iv.condition_number(J) == np.inf
-    assert iv.condition_number(np.zeros((2, 2))) == np.inf
 
 
 @shapes
 def test_a_masked_task_minimises_the_weighted_error_and_omits_entries_of_weight_zero(m, n):
     rng = np.random.default_rng(10)
     J, x_dot, M = rng.normal(size=(m, n)), rng.normal(size=m), rng.uniform(0.5, 2.0, m)
-    q_dot = iv.damped_least_squares(*iv.masked_task(J, x_dot, M), 0.0)
-    np.testing.assert_allclose(J.T @ (M * (x_dot - J @ q_dot)), 0.0, atol=1e-12)
-    M[-1] = 0.0
-    alone = iv.prioritized([iv.masked_task(J, x_dot, M)])
+    M[-1] *= m == 1
     roots = np.sqrt(M)
     expected = np.linalg.pinv(roots[:, np.newaxis] * J) @ (roots * x_dot)
-    np.testing.assert_allclose(alone, expected, atol=1e-12)
+    found = iv.damped_least_squares(*iv.masked_task(J, x_dot, M), 0.0)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 # --- Priorities. That each task is done as well as those before it allow, test_documents.py shows
@@ -245,13 +245,13 @@ def test_each_task_contributes_a_bounded_velocity_and_leaves_those_before_it_alm
         before = after
 
 
-@pytest.mark.parametrize('step', [1e-3, 1e-6, 1e-9])
-def test_damped_priorities_are_continuous_in_all_jacobians(step):
+def test_damped_priorities_are_continuous_in_all_jacobians():
     rng = np.random.default_rng(8)
     tasks = tasks_in_conflict(rng)
-    others = [(J + step * rng.normal(size=J.shape), x_dot) for J, x_dot in tasks]
-    change = norm(iv.prioritized(others, 0.3) - iv.prioritized(tasks, 0.3))
-    assert change.max() < 5e3 * step
+    for step in (1e-3, 1e-6, 1e-9):
+        others = [(J + step * rng.normal(size=J.shape), x_dot) for J, x_dot in tasks]
+        change = norm(iv.prioritized(others, 0.3) - iv.prioritized(tasks, 0.3))
+        assert change.max() < 5e3 * step
 
 
 @pytest.mark.parametrize('damping', [0.0, 0.1])
@@ -259,12 +259,11 @@ def test_tasks_of_one_robot_and_of_many_broadcast(damping):
     rng = np.random.default_rng(14)
     many = rng.normal(size=(3, 1, 2, 4)), rng.normal(size=(2, 2))
     one = rng.normal(size=(1, 4)), rng.normal(size=1)
-    for order in ((many, one), (one, many, one)):
-        together = iv.prioritized(order, damping)
-        assert together.shape == (3, 2, 4)
-        for i, j in np.ndindex(3, 2):
-            tasks = [(J[i, 0], x_dot[j]) if J.ndim > 2 else (J, x_dot) for J, x_dot in order]
-            np.testing.assert_allclose(together[i, j], iv.prioritized(tasks, damping), atol=1e-10)
+    together = iv.prioritized((one, many, one), damping)
+    assert together.shape == (3, 2, 4)
+    for i, j in np.ndindex(3, 2):
+        alone = iv.prioritized((one, (many[0][i, 0], many[1][j]), one), damping)
+        np.testing.assert_allclose(together[i, j], alone, atol=1e-10)
 
 
 # --- Limits and weights
@@ -276,14 +275,11 @@ def test_limits_are_never_exceeded_and_all_tasks_keep_their_direction():
     limits = 10.0 ** rng.uniform(-2.0, 2.0, (COUNT, 5))
     free, q_dot = iv.prioritized(tasks), iv.prioritized(tasks, max_velocity=limits)
     assert np.all(np.abs(q_dot) <= limits)
-    factor = norm(q_dot) / norm(free)
-    np.testing.assert_allclose(q_dot, factor[:, np.newaxis] * free, rtol=1e-12, atol=1e-14)
     # No slower than necessary.
-    at_limit = (np.abs(q_dot) / limits).max(axis=1)
-    np.testing.assert_allclose(at_limit[factor < 1.0 - 1e-12], 1.0, rtol=1e-12)
-    within = np.all(np.abs(free) <= limits, axis=1)
-    assert 0.01 < within.mean() < 0.99
-    assert np.array_equal(q_dot[within], free[within])
+    factor = np.minimum((limits / np.abs(free)).min(axis=1), 1.0)
+    assert 0.01 < np.mean(factor == 1.0) < 0.99
+    np.testing.assert_allclose(q_dot, factor[:, np.newaxis] * free, rtol=1e-12, atol=1e-14)
+    assert np.array_equal(q_dot[factor == 1.0], free[factor == 1.0])
     # One limit for all joints, and none.
     assert iv.limit_velocity([3.0, -4.0], 2.0).tolist() == [1.5, -2.0]
     assert iv.limit_velocity([3.0, -4.0], [np.inf, 8.0]).tolist() == [3.0, -4.0]
@@ -327,7 +323,6 @@ TASK = WIDE, X_DOT
 @pytest.mark.parametrize(
     ('function', 'bad', 'message'),
     [
-        (iv.damped_least_squares, {'damping': -0.1}, r'damping must be zero or positive.* got -0\.1'),
         (iv.null_space_projector, {'damping': -0.1}, r'damping must be zero or positive'),
         (iv.damped_least_squares, {'weights': [1.0, 0.0, 1.0]}, r'weights must be positive .* got 0\.0'),
         (iv.damping, {'manipulability': -1e-9}, r'manipulability must be zero or .* got -1e-09'),
@@ -335,7 +330,6 @@ TASK = WIDE, X_DOT
         (iv.damping, {'maximum': -1.0}, r'maximum must be zero or positive'),
         (iv.masked_task, {'mask': [1.0, -1.0]}, r'mask must be zero or positive'),
         (iv.joint_limit_cost, {'upper': [-3.0, 1.0]}, r'upper must be above lower'),
-        (iv.joint_limit_gradient, {'upper': [-4.0, 1.0]}, r'upper must be above lower'),
         (iv.manipulability_gradient, {'jacobian': lambda q: np.eye(2)}, r'jacobian must return'),
         (iv.limit_velocity, {'max_velocity': [1.0, 0.0, 1.0]}, r'max_velocity must be positive, got'),
         (iv.prioritized, {'damping': -0.1}, r'damping must be zero or positive'),
