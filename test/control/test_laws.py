@@ -105,20 +105,6 @@ def test_the_offset_point_moves_straight_towards_its_goal_whatever_the_heading()
             offset_point(np.zeros(3), [1.0, 1.0], 1.0, axle_centre)
 
 
-def test_the_offset_point_arrives_when_it_should_with_the_axle_beside_the_goal():
-    (states, targets), d = random_poses(17, 200), random_offsets(18, 200)
-    d += np.copysign(0.2, d)
-    states[:40, 2], goals = np.pi, targets[:, :2]
-    goals[:20] = states[:20, :2] + [3.0, 0.0]  # exactly behind
-    found = closed_loops(offset_point, states, goals, 1.0, d, duration=15.0, arrival=Arrival(offset=d))
-    assert found.arrived.all()
-    assert np.hypot(*(point(found.pose, d) - goals).T).max() <= 0.02
-    axle = np.hypot(*(found.pose[:, :2] - goals).T)
-    assert np.abs(axle - np.abs(d)).max() <= 0.02
-    distance = np.hypot(*(point(states, d) - goals).T)
-    assert np.abs(found.time - np.log(np.maximum(distance / 0.02, 1.0))).max() < 0.3
-
-
 # --- Aicardi et al.: position and heading
 
 
@@ -159,21 +145,16 @@ def test_at_the_position_the_commands_are_zero_whatever_the_headings():
 
 
 def test_poses_are_reached_from_everywhere():
-    """A batch of robots without limits, within limits, and that may not back up, with other gains."""
-    # The first 40 have no limits.
-    limited, forwards, near = slice(40, 80), slice(80, 120), slice(120, 160)
-    states, targets = random_poses(28, 160, 1.5)
+    """A batch of robots without limits, within limits, and that may not back up."""
+    states, targets = random_poses(28, 120, 1.5)
+    limited, forwards = slice(40, 80), slice(80, 120)
     # Under limits the paths are shorter: several of them take long all the same.
     states[limited], targets[limited] = random_poses(30, 40, 0.7)
-    states[near], targets[near] = random_poses(29, 40, 0.05)
     # Exactly behind, and with headings of pi.
-    states[120::2, 2], targets[120::3, 2] = np.pi, -np.pi
-    states[120::5, :2], targets[120::7, :2] = [0.3, 0.0], 0.0
-    Kp, Kv = np.full((2, 160), [[KP], [KV]])
+    states[::8, 2], targets[::12, 2] = np.pi, -np.pi
+    Kp = np.full(120, KP)
     Kp[forwards] = np.repeat([6.0, 12.0, 24.0, 45.0], 10)
-    Kv[near], ratio = np.random.default_rng(29).uniform([[0.3], [1.0]], [[2.0], [10.0]], (2, 40))
-    Kp[near] = Kv[near] * ratio
-    v, omega, wheels = np.full((3, 160), np.inf)
+    v, omega, wheels = np.full((3, 120), np.inf)
     v[limited], omega[limited], wheels[limited] = 0.22, 2.84, 6.67
     min_v = -v
     min_v[forwards] = 0.0
@@ -181,7 +162,7 @@ def test_poses_are_reached_from_everywhere():
         min_v=min_v, max_v=v, min_omega=-omega, max_omega=omega, max_wheel_speed=wheels
     )
     how = {'arrival': Arrival(use_heading=True), 'limits': limits, 'duration': 90.0}
-    found = closed_loops(go_to_pose, states, targets, Kp, Kv, **how)
+    found = closed_loops(go_to_pose, states, targets, Kp, KV, **how)
     off = np.hypot(*(found.pose - targets).T[:2])
     turned = np.abs(se2.wrap_angle((found.pose - targets)[:, 2]))
     failed = np.flatnonzero(~found.arrived | (off > 0.02) | (turned > 0.02))

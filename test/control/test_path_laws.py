@@ -169,21 +169,16 @@ def test_follows_a_figure_eight(controller):
 
 
 def test_a_robot_that_is_too_slow_for_a_trajectory_is_late_and_drives_on_to_its_end():
-    model = RobotModel(limits=VelocityLimits(max_v=0.2))
-    result = follow_path(KANAYAMA, line_path(3.0).timed(1.0), model=model, timeout=30.0)
+    model, line = RobotModel(limits=VelocityLimits(max_v=0.2)), line_path(3.0).timed(1.0)
+    result = follow_path(KANAYAMA, line, model=model, timeout=30.0)
     assert result.finished
     assert result.poses[-1, 0] == pytest.approx(2.98, abs=0.01)
     # 3 m at 0.2 m/s, instead of in 3 s.
     assert result.late[-1] == pytest.approx(result.times[-1] - 3.0) == pytest.approx(15.9, abs=0.2)
     # The times wait: the error along counts from where they stand.
     assert abs(result.errors[:, 0]).max() < 0.35
-    second = result.times.searchsorted(1.0)
-    planned = (result.times[second] - result.late[second]) * 1.0
-    assert planned - result.poses[second, 0] == pytest.approx(0.3, abs=0.03)
-    assert not follow_path(KANAYAMA, line_path(3.0).timed(1.0), model=model, timeout=16.0).finished
-    quick = follow_path(KANAYAMA, line_path(3.0).timed(1.0))
-    assert quick.finished
-    assert quick.late == pytest.approx(0.0, abs=1e-9)
+    assert not follow_path(KANAYAMA, line, model=model, timeout=16.0).finished
+    assert follow_path(KANAYAMA, line).late == pytest.approx(0.0, abs=1e-9)
     assert np.isnan(follow_path(KANAYAMA, line_path(0.3)).late).all()
 
 

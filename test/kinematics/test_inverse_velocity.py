@@ -134,26 +134,10 @@ def test_the_projector_and_the_pseudo_inverse_count_the_same_values_as_zero():
     assert 0.3 < np.trace(N, axis1=1, axis2=2).mean() < 0.7
 
 
-@shapes
-def test_damping_bounds_joint_velocities_and_what_the_null_space_leaks(m, n):
-    rng = np.random.default_rng(7)
-    J = decomposed(rng, m, n)[0]
-    J[::10] = 0.0
-    J[1::10] = J[1::10, :1]  # equal rows
-    J[2::10] = J[2::10, :, :1]  # equal columns
-    x_dot, wish = rng.normal(size=(COUNT, m)), rng.normal(size=(COUNT, n))
-    damping = np.logspace(-12.0, 3.0, 16)[:, np.newaxis]
-    q_dot = iv.damped_least_squares(J, x_dot, damping)
-    assert np.all(norm(q_dot) <= norm(x_dot) / (2.0 * damping) * (1.0 + 1e-12))
-    leak = norm(times(J, iv.redundant(J, np.zeros(m), wish, damping)))
-    assert np.all(leak <= (iv.FILTER * damping / 4.0 + 1e-12 * size(J)) * norm(wish))
-    # Both bounds are reached, along a singular vector.
+def test_damped_velocities_reach_their_bound_along_a_singular_vector():
     for value in (0.1, 1e-20):
-        fastest = iv.damped_least_squares(np.diag([value, *[1.0] * 6])[:m, :n], np.eye(m)[0], value)
+        fastest = iv.damped_least_squares(np.diag([value, 1.0]), [1.0, 0.0], value)
         assert norm(fastest) == pytest.approx(1.0 / (2.0 * value), rel=1e-14)
-    J = np.eye(m, n) * iv.FILTER * 0.3 / 2.0
-    worst = J @ iv.redundant(J, np.zeros(m), np.eye(n)[0], 0.3)
-    assert norm(worst) == pytest.approx(iv.FILTER * 0.3 / 4.0)
 
 
 def test_damping_sets_in_below_the_threshold_and_grows_to_the_maximum():
@@ -243,15 +227,6 @@ def test_each_task_contributes_a_bounded_velocity_and_leaves_those_before_it_alm
             moved = norm(times(earlier, after - before))
             assert np.all(moved <= iv.FILTER / 8.0 * missing + 1e-9 * norm(after - before))
         before = after
-
-
-def test_damped_priorities_are_continuous_in_all_jacobians():
-    rng = np.random.default_rng(8)
-    tasks = tasks_in_conflict(rng)
-    for step in (1e-3, 1e-6, 1e-9):
-        others = [(J + step * rng.normal(size=J.shape), x_dot) for J, x_dot in tasks]
-        change = norm(iv.prioritized(others, 0.3) - iv.prioritized(tasks, 0.3))
-        assert change.max() < 5e3 * step
 
 
 @pytest.mark.parametrize('damping', [0.0, 0.1])
