@@ -172,22 +172,21 @@ def test_advice_is_logged_and_its_failure_does_no_harm(lockstep, capfd):
     assert "the slope of controller 'my_law' failed: ZeroDivisionError" in warning
 
 
-FAILURES = (
-    (lambda *_: 1.0 / 0.0, "controller 'my_law' failed: ZeroDivisionError: float division"),
-    (lambda *_: (math.nan, 0.0), 'two finite numbers, got (nan, 0.0)'),
-    (lambda *_: (1.0, 2.0, 3.0), 'must return (v, omega), two finite numbers, got (1.0, 2.0, 3.0)'),
-    (lambda *_: 0.5, 'two finite numbers, got 0.5'),
-    (lambda *_: ([1.0], [2.0]), 'two finite numbers, got'),
-    (lambda *_: ('1', None), 'two finite numbers, got'),
+@pytest.mark.parametrize(
+    ('law', 'words'),
+    [
+        (lambda *_: 1.0 / 0.0, "controller 'my_law' failed: ZeroDivisionError: float division"),
+        (lambda *_: (math.nan, 0.0), 'two finite numbers, got (nan, 0.0)'),
+        (lambda *_: (1.0, 2.0, 3.0), 'must return (v, omega), two finite numbers, got (1.0, 2.0, 3.0)'),
+        (lambda *_: 0.5, 'two finite numbers, got 0.5'),
+        (lambda *_: ([1.0], [2.0]), 'two finite numbers, got'),
+        (lambda *_: ('1', None), 'two finite numbers, got'),
+    ],
 )
-
-
-def test_a_law_that_fails_is_an_error_with_its_cause():
-    for fails, words in FAILURES:
-        bound = replace(MINE, law=fails).bind(GoToGoalParameters())
-        with pytest.raises(LawError, match=re.escape(words)) as caught:
-            bound(np.zeros(3), np.ones(3))
-        assert isinstance(caught.value.__cause__, ZeroDivisionError) == ('Zero' in words)
+def test_a_law_that_fails_is_an_error_with_its_cause(law, words):
+    with pytest.raises(LawError, match=re.escape(words)) as caught:
+        replace(MINE, law=law).bind(GoToGoalParameters())(np.zeros(3), np.ones(3))
+    assert isinstance(caught.value.__cause__, ZeroDivisionError) == ('Zero' in words)
 
 
 def test_a_law_that_fails_stops_the_robot_and_aborts_the_goal(lockstep, capfd):
@@ -195,18 +194,15 @@ def test_a_law_that_fails_stops_the_robot_and_aborts_the_goal(lockstep, capfd):
     lockstep.add(make(VirtualRobot))
     controller = replace(MINE, law=lambda *given: (broken or [MINE.law])[-1](*given))
     node = lockstep.add(GoToGoal(controller=controller))
-    assert node.get_parameter('controller').value == 'my_law'
-    for fails, words in FAILURES[:2]:
-        broken.clear()
-        lockstep.publish('goal_pose', goal(20.0, 0.5))
-        lockstep.run_for(0.1)
-        assert twists(topics.commands)[-1] != (0.0, 0.0)
-        broken.append(fails)
-        lockstep.run_for(0.1)
-        assert twists(topics.commands)[-1] == (0.0, 0.0)
-        assert topics.statuses[-1] == ABORTED
-        assert node.waypoint is None
-        assert words in capfd.readouterr().err
+    lockstep.publish('goal_pose', goal(20.0, 0.5))
+    lockstep.run_for(0.1)
+    assert twists(topics.commands)[-1] != (0.0, 0.0)
+    broken.append(lambda *_: (math.nan, 0.0))
+    lockstep.run_for(0.1)
+    assert twists(topics.commands)[-1] == (0.0, 0.0)
+    assert topics.statuses[-1] == ABORTED
+    assert node.waypoint is None
+    assert 'two finite numbers, got (nan, 0.0)' in capfd.readouterr().err
     # The node goes on with a law that works.
     assert change(node, controller='go_to_goal', kp=24.0, kv=12.0).successful
     lockstep.publish('goal_pose', goal(0.5, 0.2))
@@ -249,15 +245,12 @@ def test_every_field_is_described():
     ('changes', 'words'),
     [
         ({'name': 'two words'}, "'_', '.' or '-', at most 64, got 'two words'"),
-        ({'name': 3}, 'got 3'),
         ({'law': 'law'}, 'law must be a function'),
         ({'gains': [KP, KV]}, 'gains must be a tuple of Gain'),
         ({'gains': (KP, KP)}, 'gains must have different names, got kp, kp'),
         ({'state': (math.nan,)}, 'state must be finite'),
         ({'offset': 'd'}, "offset must be '' or one of kp, kv, got 'd'"),
         ({'takes_heading': 1}, 'takes_heading must be True or False'),
-        ({'slope': 1.0}, 'slope must be a function'),
-        ({'boundary': (1.0, '')}, 'boundary must be of class Boundary'),
     ],
 )
 def test_invalid_controllers_are_refused(changes, words):
@@ -270,14 +263,11 @@ def test_invalid_controllers_are_refused(changes, words):
     [
         ({'name': 'K'}, 'name of a gain must be a lower-case letter'),
         ({'name': 'lambda'}, "got 'lambda'"),
-        ({'unit': 3}, 'unit must be'),
         ({'default': 5.0}, 'ki must be in [-1, 2], got 5'),
         ({'above': 1.0}, 'ki must be in (1, 2], got 1'),
         ({'bounds': (1.0,)}, 'bounds must have shape (..., 2)'),
         ({'usual': (1.0, 1.0)}, 'usual must be (first, last) with first < last'),
         ({'usual': (0.0, 3.0)}, 'ki must be in [-1, 2], got 3'),
-        ({'usual': (-2.0, 0.0)}, 'ki must be in [-1, 2], got -2'),
-        ({'usual': None}, 'usual must '),
     ],
 )
 def test_invalid_gains_are_refused(changes, words):

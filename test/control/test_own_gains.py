@@ -14,8 +14,7 @@ from support import commands
 from support.lockstep_nodes import change, make
 from support.ros_messages import goal, odometry
 
-from diffdrive_jacobian import control
-from diffdrive_jacobian.control import KP, KV, OFFSET, Controller, Gain, LawError
+from diffdrive_jacobian.control import KP, Controller, Gain, LawError
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -152,20 +151,6 @@ def test_gains_named_as_options_are_swept_under_another_name(monkeypatch, tmp_pa
     assert 'fastest: grid 0.6' in ended.out
 
 
-def test_a_driven_point_is_swept_with_its_offset():
-    controller = Controller(
-        name='point',
-        law=lambda poses, goals, kp, kv, d: control.offset_point(poses, goals, kv, d),
-        gains=(KP, KV, OFFSET),
-        offset='offset',
-    )
-    gains = {'kp': (2.0, 4.0), 'kv': (0.5, 1.0), 'offset': -0.3}
-    swept = sweep(SweepSetup(gains=gains, grid=2, starts=2, rate=20.0, controller=controller))
-    assert swept.complete.all()
-    x, y = swept.outcomes.pose[..., 0], swept.outcomes.pose[..., 1]
-    assert np.hypot(x, y) == pytest.approx(0.3, abs=0.021)
-
-
 def test_what_cannot_be_swept_is_refused():
     setup = SweepSetup(starts=2)
     with pytest.raises(ValueError, match="two gains to be swept, but 'polar' has k_rho"):
@@ -223,25 +208,16 @@ def test_a_state_is_reset_while_the_robot_stands(lockstep, clock):
     assert clock.calls == [(5.0, 0.0), (5.0, 0.1), (5.0, 0.0)]
 
 
-def test_the_integral_removes_a_bias_in_node_and_batch_alike():
-    def biased(*arguments, **more):
-        v, omega, *state = INTEGRAL.law(*arguments, **more)
-        return (v, omega - 1.0, *state)
-
-    controller, ends = replace(INTEGRAL, law=biased), []
-    for ki in (0.0, 2.0):
-        bound, theta = controller.bind(SimpleNamespace(kp=2.0, kv=0.0, ki=ki)), 0.3
-        for step in range(250):
-            bound.now = step * 20_000_000
-            _, omega = bound((0.0, 0.0, theta), (1.0, 0.0, 0.0))
-            theta += omega * 0.02
-        ends.append(theta)
-        # The robots of a batch have states of their own.
-        starts = [[0.0, 0.0, 0.3], [-1.0, 0.5, 2.0]]
-        batch = closed_loops(controller, starts, [1.0, 0.0], 2.0, 0.0, ki, duration=5.0)
-        assert batch.pose[0, 2] == pytest.approx(theta, abs=1e-12)
-    assert ends[0] == pytest.approx(-0.5, abs=2e-3)
-    assert abs(ends[1]) < 2e-2
+def test_a_law_with_a_state_drives_in_a_node_and_in_a_batch_alike():
+    bound, theta = INTEGRAL.bind(SimpleNamespace(kp=2.0, kv=0.0, ki=2.0)), 0.3
+    for step in range(50):
+        bound.now = step * 20_000_000
+        _, omega = bound((0.0, 0.0, theta), (1.0, 0.0, 0.0))
+        theta += omega * 0.02
+    # The robots of a batch have states of their own.
+    starts = [[0.0, 0.0, 0.3], [-1.0, 0.5, 2.0]]
+    batch = closed_loops(INTEGRAL, starts, [1.0, 0.0], 2.0, 0.0, 2.0, duration=1.0)
+    assert batch.pose[0, 2] == pytest.approx(theta, abs=1e-12)
 
 
 def test_an_equation_may_have_a_state_too_and_time_that_goes_back_is_no_time():

@@ -35,6 +35,7 @@ Q, X_DOT, WHOLE_Q = (0.5, 0.9), (0.1, -0.2), (0.1, 0.2, 0.3, 0.5, 0.9)
 SQUARE, WIDE = ARM.jacobian(Q), PlanarArm([0.5, 0.4, 0.3]).jacobian([0.1, 0.2, 0.3])
 WEIGHTS, RANGE = (1.0, 2.0, 0.5), {'lower': (-3.0, -2.0), 'upper': (2.0, 2.5)}
 TASKS = [(WIDE, X_DOT), ([[1.0, 0.0, 2.0]], [0.5])]
+VECTOR, OTHER_VECTOR = (*POSE, 0.1, 0.2, 0.3), (*GOAL, 0.5, -0.4, 0.2, 1.0)
 HERE, THERE = np.eye(4), np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 LOOP = {
     **{'law': control.go_to_goal, 'starts': POSE, 'goals': GOAL, 'rate': 10.0, 'duration': 0.3},
@@ -70,22 +71,10 @@ BROADCASTING = {
     rigid_body.point_velocity: {'v': POSE, 'omega': POSE, 'offset': (0.0, 0.1, 0.2)},
     spatial.spatial_displacement: {'T': HERE, 'T_desired': THERE},
     spatial.pose_vector: {'T': THERE},
-    spatial.pose_vector_difference: {
-        'target': (*POSE, 0.1, 0.2, 0.3),
-        'pose': (*GOAL, 0.5, -0.4, 0.2, 1.0),
-    },
-    spatial.pose_vector_displacement: {
-        'target': (*POSE, 0.1, 0.2, 0.3),
-        'pose': (*GOAL, 0.5, -0.4, 0.2, 1.0),
-    },
-    spatial.pose_vector_difference_jacobian: {
-        'e': (*POSE, 0.1, 0.2, 0.3),
-        'J': SPATIAL.jacobian(WHOLE_Q),
-    },
-    spatial.spatial_displacement_jacobian: {
-        'Delta': (*POSE, 0.1, 0.2, 0.3),
-        'J': SPATIAL.jacobian(WHOLE_Q, 'end'),
-    },
+    spatial.pose_vector_difference: {'target': VECTOR, 'pose': OTHER_VECTOR},
+    spatial.pose_vector_displacement: {'target': VECTOR, 'pose': OTHER_VECTOR},
+    spatial.pose_vector_difference_jacobian: {'e': VECTOR, 'J': SPATIAL.jacobian(WHOLE_Q)},
+    spatial.spatial_displacement_jacobian: {'Delta': VECTOR, 'J': SPATIAL.jacobian(WHOLE_Q, 'end')},
     **{call: {'q': WHOLE_Q} for call in (SPATIAL.forward_kinematics, SPATIAL.joint_positions)},
     SPATIAL.jacobian: {'q': WHOLE_Q},
     SPATIAL.joint_torques: {'q': WHOLE_Q, 'wrench': (*POSE, *GOAL, 0.4)},
@@ -98,10 +87,8 @@ BROADCASTING = {
         'max_velocity': (1.0, 4.0, 2.0),
     },
     ik.pose_difference: {'target': (1.0, 2.0, 3.0), 'pose': (0.5, 0.5, -3.0)},
-    ARM.joint_positions: {'q': Q},
-    ARM.forward_kinematics: {'q': Q},
-    ARM.jacobian: {'q': Q},
-    ARM.determinant: {'q': Q},
+    **{call: {'q': Q} for call in (ARM.joint_positions, ARM.forward_kinematics)},
+    **{call: {'q': Q} for call in (ARM.jacobian, ARM.determinant)},
     ARM.singular_configurations: {'q_1': 0.5},
     ARM.inverse_kinematics: {'position': (1.0, 0.5)},
     ARM.inverse_velocity: {'q': Q, 'x_dot': X_DOT},
@@ -109,17 +96,14 @@ BROADCASTING = {
     ARM.clearance_gradient: {'q': Q, 'obstacle': GOAL},
     ARM.joint_torques: {'q': Q, 'wrench': (0.1, -0.2, 0.3)},
     ARM.integrate: {'q': Q, 'q_dot': X_DOT, 'dt': 0.1},
-    MANIPULATOR.forward_kinematics: {'q': WHOLE_Q},
-    MANIPULATOR.jacobian: {'q': WHOLE_Q},
+    **{call: {'q': WHOLE_Q} for call in (MANIPULATOR.forward_kinematics, MANIPULATOR.jacobian)},
     MANIPULATOR.configuration_jacobian: {'q': WHOLE_Q},
     MANIPULATOR.integrate: {'q': WHOLE_Q, 'q_dot': (3.0, 2.0, 0.1, 0.2), 'dt': 0.1},
     control.go_to_goal: {'state': POSE, 'goal': GOAL, 'Kp': 3.0, 'Kv': 0.5},
     control.turn_in_place: {'theta': 0.5, 'heading': 3.0, 'Kp': 3.0},
     control.offset_point: {'state': POSE, 'goal': GOAL, 'k': 0.5, 'd': 0.1},
     control.pure_pursuit: {'state': POSE, 'reference': REFERENCE, 'l_d': 0.2},
-    control.kanayama: {
-        **{'state': POSE, 'reference': REFERENCE, 'K_x': 2.0, 'K_y': 25.0, 'K_theta': 10.0}
-    },
+    control.kanayama: {'state': POSE, 'reference': REFERENCE, 'K_x': 2.0, 'K_y': 25.0, 'K_theta': 9.0},
     control.offset_point_tracking: {'state': POSE, 'reference': REFERENCE, 'k': 1.5, 'd': 0.1},
     control.dynamic_feedback_linearization: {
         **{'pose': POSE, 'reference': REFERENCE, 'K_p': 4.0, 'K_d': 4.0, 'state': (0.3,), 'dt': 0.02}
