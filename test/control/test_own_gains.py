@@ -208,18 +208,6 @@ def test_a_state_is_reset_while_the_robot_stands(lockstep, clock):
     assert clock.calls == [(5.0, 0.0), (5.0, 0.1), (5.0, 0.0)]
 
 
-def test_a_law_with_a_state_drives_in_a_node_and_in_a_batch_alike():
-    bound, theta = INTEGRAL.bind(SimpleNamespace(kp=2.0, kv=0.0, ki=2.0)), 0.3
-    for step in range(50):
-        bound.now = step * 20_000_000
-        _, omega = bound((0.0, 0.0, theta), (1.0, 0.0, 0.0))
-        theta += omega * 0.02
-    # The robots of a batch have states of their own.
-    starts = [[0.0, 0.0, 0.3], [-1.0, 0.5, 2.0]]
-    batch = closed_loops(INTEGRAL, starts, [1.0, 0.0], 2.0, 0.0, 2.0, duration=1.0)
-    assert batch.pose[0, 2] == pytest.approx(theta, abs=1e-12)
-
-
 def test_an_equation_may_have_a_state_too_and_time_that_goes_back_is_no_time():
     @formula('(3),(2),(),(1),() -> (),(),(1)')
     def law(pose, goal, kp, state, dt):
