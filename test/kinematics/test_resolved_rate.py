@@ -150,22 +150,6 @@ def test_beyond_the_edge_joints_stay_slow_and_the_error_is_reported(start, end, 
     assert np.linalg.norm(undamped.q_dot, axis=-1).max() > 5.0 * speed.max()
 
 
-def test_beyond_the_edge_a_secondary_task_costs_little_and_joints_come_to_rest():
-    q0 = np.array([0.3, 0.4, 0.5])
-    start = ARM_3.forward_kinematics(q0)[:2]
-    line = StraightLine(start, start / np.linalg.norm(start) * 1.6, 0.2)
-    how = {'threshold': 0.3, 'settling': 0.8}
-    alone = track_line(ARM_3, q0, line, **how)
-
-    def away_from_singularities(q):
-        return 5.0 * iv.manipulability_gradient(ARM_3.jacobian, q)
-
-    run = track_line(ARM_3, q0, line, secondary=away_from_singularities, **how)
-    assert run.error.max() < alone.error.max() + 0.3e-3
-    assert np.linalg.norm(np.diff(run.q_dot, axis=0), axis=-1).sum() < 5.0
-    assert np.linalg.norm(run.q_dot[-1] - run.q_dot[-2]) < 1e-2
-
-
 # --- Mobile manipulators: secondary tasks, weights, limits
 
 
