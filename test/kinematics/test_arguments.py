@@ -7,14 +7,13 @@ results, and a batch gives what its robots give alone.
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import itertools
 import re
 from collections import defaultdict
 
 import numpy as np
 import pytest
-from public_calls import BROADCASTING, CALLS, FIXED, OTHERS, POSE, WHEELS
+from public_calls import BROADCASTING, CALLS, FIXED, POSE, WHEELS
 
 from diffdrive_jacobian import control, simulation
 from diffdrive_jacobian.control import Arrival, VelocityLimits
@@ -29,19 +28,6 @@ from diffdrive_jacobian.kinematics import (
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.simulation.closed_loop import Outcomes
 
-ELSEWHERE = {
-    *('solve', 'METHODS', 'IKResult', 'track_line', 'remaining', 'resumed', 'all', 'names', 'twist'),
-    *('wheel_speeds', 'reached', 'stopped', 'Path', 'PathController', 'PathError', 'Reference'),
-    *('follow_path', 'circle_path', 'figure_eight_path', 'line_path', 'planned_path'),
-    *('Boundary', 'Controller', 'ControllerError', 'Controllers', 'Gain', 'LawError'),
-    *('path_controller_names', 'find_path_controller', 'controller_names', 'find_controller'),
-    *('KP', 'KV', 'OFFSET', 'CUTOFF', 'FILTER', 'Ellipsoid'),
-    *('Sweep', 'SweepSetup', 'describe_sweep', 'sweep', 'sweep_table'),
-    *('AccelerationLimits', 'Actuators', 'AxisLimits'),
-    # Without checks: of values that were checked.
-    *('steady', 'follow', 'progress'),
-}
-"""Public names that are no functions of numbers, or tested in files of their own."""
 OPTIONAL = {
     *('h', 'arrival', 'progress', 'commanded_at', 'seed', 'drift', 'threshold', 'q_dot_0'),
     *('weights', 'max_velocity', 'max_correction'),
@@ -132,15 +118,12 @@ def named_or_finite(call, name, bad):
     return result, error
 
 
-def test_every_public_function_is_called_here():
-    called = {name_of(call).split('.')[-1] for call in CALLS} | ELSEWHERE
-    modules = control, simulation, iv, contact, diff_drive, inverse_kinematics, rigid_body, se2, spatial
-    public = {name for module in modules for name in module.__all__}
-    for call in OTHERS:
-        cls = call if inspect.isclass(call) else type(getattr(call, '__self__', None))
-        # Those of other classes are properties, and functions without checks for every message.
-        public |= {name for name, _ in inspect.getmembers(cls, inspect.isfunction)}
-    assert {name for name in public if not name.startswith('_')} <= called
+def test_every_equation_is_called_here():
+    modules = control, contact, diff_drive, inverse_kinematics, iv, rigid_body, se2, spatial
+    public = [
+        vars(module)[name] for module in modules for name in module.__all__ if name in vars(module)
+    ]
+    assert {function for function in public if hasattr(function, 'formula')} <= {*CALLS}
 
 
 @every(CALLS)

