@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from own_laws import Site, example
+from own_laws import EXAMPLES, Site, example
 from support import commands
 from support.lockstep_nodes import change, make
 from support.ros_messages import goal, odometry
@@ -23,7 +23,6 @@ from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.plots import sweep_figure
 from diffdrive_jacobian.simulation import SweepSetup, closed_loops, sweep, sweep_table
-from diffdrive_jacobian.tools import sweep_gains
 
 POLAR, INTEGRAL = example('polar'), example('integral')
 
@@ -107,8 +106,6 @@ def test_help_and_the_page_describe_the_gains_of_the_controller_that_is_chosen(s
 
 # --- Sweeps
 
-SMALL = ('--grid', '2', '--starts', '1', '--rate', '10', '--csv', 'a.csv')
-
 
 def test_three_gains_are_swept_two_at_a_time_and_drawn():
     gains = {'k_alpha': (1.5, 3.0), 'k_beta': -0.3}
@@ -127,28 +124,19 @@ def test_three_gains_are_swept_two_at_a_time_and_drawn():
     assert 'defaults: k_rho 0.5, k_alpha 2' in texts
 
 
-def test_an_installed_controller_is_swept_by_the_tool(site, tmp_path, monkeypatch):
-    site.install('polar')
+def test_an_installed_controller_is_swept_by_the_tool_also_with_a_gain_named_as_an_option(
+    site, tmp_path, monkeypatch
+):
+    site.install('polar', EXAMPLES['polar'].replace("'k_rho'", "'grid'"))
     monkeypatch.chdir(tmp_path)
-    arguments = ('--controller', 'polar', '--k_beta', ' -0.8', ' -0.2', '--k_rho', '0.5', *SMALL)
-    ended = commands.run('sweep_gains', *arguments)
-    assert ended.code == 0
-    assert 'fastest: k_alpha' in ended.out
-    header, *rows = (tmp_path / 'a.csv').read_text().splitlines()
-    assert header.startswith('k_alpha_per_s,k_beta_per_s,')
-    assert len(rows) == 4
-
-
-def test_gains_named_as_options_are_swept_under_another_name(monkeypatch, tmp_path):
-    grid = Gain(name='grid', default=0.5, bounds=(0.0, 10.0))
-    odd = replace(POLAR, gains=(grid, *POLAR.gains[1:]))
-    known = {**sweep_gains.CONTROLLERS.built_in, 'polar': odd}
-    monkeypatch.setattr(sweep_gains.CONTROLLERS, '_known', known)
-    monkeypatch.chdir(tmp_path)
-    arguments = ('--controller', 'polar', '--gain-grid', '0.3', '0.6', '--k_beta', '-0.3', *SMALL)
-    ended = commands.run('sweep_gains', *arguments)
+    arguments = ('--gain-grid', '0.3', '0.6', '--k_beta', ' -0.8', ' -0.2', '--k_alpha', '2')
+    small = ('--grid', '2', '--starts', '1', '--rate', '10', '--csv', 'a.csv')
+    ended = commands.run('sweep_gains', '--controller', 'polar', *arguments, *small)
     assert ended.code == 0
     assert 'fastest: grid 0.6' in ended.out
+    header, *rows = (tmp_path / 'a.csv').read_text().splitlines()
+    assert header.startswith('grid_per_s,k_beta_per_s,')
+    assert len(rows) == 4
 
 
 def test_what_cannot_be_swept_is_refused():

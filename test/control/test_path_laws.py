@@ -205,17 +205,23 @@ def test_settings_do_not_change_the_look_ahead_of_the_law():
     np.testing.assert_array_equal(same.poses, alone.poses)
 
 
-def test_invalid_arguments_are_named():
-    for arguments, words in (
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
         ({'controller': find_controller('pose')}, 'controller must be of class PathController'),
         ({'controller': 'pose'}, "path_controller must be one of .* got 'pose', a law of goals"),
         ({'path': [[0, 0], [1, 0]]}, 'path must be of class Path'),
         ({'rate': 0.0}, r'rate must be in \(0, 1000000000\] Hz'),
         ({'gains': {'k_y': math.nan}}, 'k_y must be in'),
         ({'gains': {'kp': 1.0}}, 'gains must be among k_x, k_y, k_theta, got kp'),
-    ):
-        with pytest.raises(ValueError, match=words):
-            follow_path(**{'controller': KANAYAMA, 'path': eight(), **arguments})
+    ],
+)
+def test_invalid_arguments_are_named(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        follow_path(**{'controller': KANAYAMA, 'path': eight(), **arguments})
+
+
+def test_laws_of_paths_are_no_laws_of_goals_and_look_ahead_by_a_gain():
     with pytest.raises(ControllerError, match="got 'kanayama', a law of paths"):
         find_controller('kanayama')
     with pytest.raises(ValueError, match="lookahead must be '' or one of kp, kv, got 'l'"):
