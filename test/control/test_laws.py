@@ -80,6 +80,11 @@ def test_go_to_goal_is_document_as():
     assert_allclose(np.column_stack([v, omega]), expected, rtol=1e-12, atol=1e-12)
     assert_allclose(v[:2], 0.0, atol=1e-14)
     assert_allclose(omega[:4] / gains[0, :4], [math.pi / 2, -math.pi / 2, -2 * degree, 2 * degree])
+    # The distance never grows: d_dot = -Kv d cos^2(e).
+    distance, error, _ = polar(states, targets)
+    q_dot = (diff_drive.unicycle_jacobian(states[:, 2]) @ np.stack([v, omega], -1)[..., None])[..., 0]
+    d_dot = -np.sum((targets - states)[:, :2] * q_dot[:, :2], axis=-1) / distance
+    assert_allclose(d_dot, -gains[1] * distance * np.cos(error) ** 2, rtol=1e-9, atol=1e-12)
 
 
 # --- Document B: the offset point goes straight to its goal, like exp(-k t)

@@ -119,12 +119,6 @@ def test_the_projector_and_the_pseudo_inverse_count_the_same_values_as_zero():
     assert 0.3 < np.trace(N, axis1=1, axis2=2).mean() < 0.7
 
 
-def test_damped_velocities_reach_their_bound_along_a_singular_vector():
-    for value in (0.1, 1e-20):
-        fastest = iv.damped_least_squares(np.diag([value, 1.0]), [1.0, 0.0], value)
-        assert norm(fastest) == pytest.approx(1.0 / (2.0 * value), rel=1e-14)
-
-
 def test_damping_sets_in_below_the_threshold_and_grows_to_the_maximum():
     threshold, maximum = np.array([1e-3, 0.3, 10.0]), np.array([[0.0], [0.1], [5.0]])
     share = np.linspace(0.0, 2.0, 21)[:, np.newaxis, np.newaxis]
@@ -137,13 +131,12 @@ def test_damping_sets_in_below_the_threshold_and_grows_to_the_maximum():
 
 
 @shapes
-def test_manipulability_is_the_volume_of_the_velocities_and_does_not_depend_on_axes(m, n):
-    rng = np.random.default_rng(8)
-    J = rng.normal(size=(COUNT, m, n))
-    w, gram = iv.manipulability(J), np.linalg.det(J @ transposed(J)) * (m <= n)
-    np.testing.assert_allclose(w, np.sqrt(np.maximum(gram, 0.0)), rtol=1e-7, atol=1e-7)
-    U, V = (np.linalg.qr(rng.normal(size=(side, side)))[0] for side in (m, n))
-    np.testing.assert_allclose(iv.manipulability(-3.0 * U @ J @ V), 3.0**m * w, rtol=1e-9, atol=1e-13)
+def test_manipulability_is_the_volume_of_the_velocities(m, n):
+    J = np.random.default_rng(8).normal(size=(COUNT, m, n))
+    gram = np.linalg.det(J @ transposed(J)) * (m <= n)
+    np.testing.assert_allclose(
+        iv.manipulability(J), np.sqrt(np.maximum(gram, 0.0)), rtol=1e-7, atol=1e-7
+    )
     J[:, -1] = J[:, 0] if m > 1 else 0.0
     np.testing.assert_allclose(iv.manipulability(J), 0.0, atol=1e-13)
 

@@ -38,10 +38,6 @@ def reshape_the_arm(q):
     return 10.0 * iv.manipulability_gradient(lambda q: ROBOT.arm.jacobian(q[..., 3:]), q)
 
 
-def arms_manipulability(run):
-    return iv.manipulability(ROBOT.arm.jacobian(run.q[..., 3:]))
-
-
 # --- The law and the line
 
 
@@ -146,19 +142,19 @@ def test_beyond_the_edge_joints_stay_slow_and_the_error_is_reported(start, end, 
     # And where nothing is damped yet, for the Jacobian is far from singular there.
     assert speed.max() < 12.0
     assert gone.error[-1] == pytest.approx(beyond, abs=1e-3)
-    undamped = track_line(ARM, elbow(start), line, rate=50.0)
-    assert np.linalg.norm(undamped.q_dot, axis=-1).max() > 5.0 * speed.max()
 
 
 # --- Mobile manipulators: secondary tasks, weights, limits
 
 
 def test_a_mobile_manipulator_reshapes_its_arm_while_the_tip_stays_on_the_line():
-    alone = track_line(ROBOT, Q0, ahead(), settling=1.0, rate=50.0)
-    besides = track_line(ROBOT, Q0, ahead(), secondary=reshape_the_arm, settling=1.0, rate=50.0)
+    how = {'settling': 1.0, 'rate': 50.0}
+    alone = track_line(ROBOT, Q0, ahead(), **how)
+    besides = track_line(ROBOT, Q0, ahead(), secondary=reshape_the_arm, **how)
     assert besides.error.max() < alone.error.max() + 0.02 < 0.1
     assert besides.error[-1] < 1e-3
-    assert arms_manipulability(besides)[-1] > 1.5 * arms_manipulability(alone)[-1]
+    before, after = (iv.manipulability(ROBOT.arm.jacobian(run.q[-1, 3:])) for run in (alone, besides))
+    assert after > 1.5 * before
 
 
 def test_a_batch_of_robots_and_lines_is_followed_as_each_alone():
