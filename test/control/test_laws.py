@@ -123,7 +123,7 @@ def test_go_to_pose_is_aicardis_law_with_document_as_speed():
         assert omega == pytest.approx(KP * alpha + KV * (alpha + 2.0 * -0.4), abs=1e-11)
 
 
-def test_without_a_weight_the_heading_converges_at_critical_damping_or_twice_as_fast_as_the_distance():
+def test_the_default_weight_is_critical_damping_or_twice_as_fast_as_the_distance():
     (states, targets), (Kp, Kv) = random_poses(21), random_gains(22)
     ratio = Kp / Kv
     assert 0.1 < np.mean(ratio > 4.0) < 0.9

@@ -1,4 +1,4 @@
-"""Controllers that this package does not contain: given in Python, or installed with other packages."""
+"""Controllers of others: given in Python, or installed with other packages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def site(tmp_path, monkeypatch):
 
 
 @pytest.mark.pages
-def test_the_example_is_installed_and_drives_and_its_bag_is_read_without_it(site, tmp_path, monkeypatch):
+def test_the_example_drives_and_its_bag_is_read_without_it(site, tmp_path, monkeypatch):
     (declared,) = re.findall(r'```toml\n(.*?)```', PAGE, re.DOTALL)
     group, entry = re.search(r'entry-points\."(.*?)"\]\n(.*)', declared.replace(' "', ' ')).groups()
     entry = entry.rstrip('"')
@@ -81,7 +81,7 @@ def test_built_in_controllers_cannot_be_replaced(site):
 
 
 BROKEN = {
-    'raises': ('raise RuntimeError("no\\nlicence")', 'cannot be loaded: RuntimeError: no licence'),
+    'raises': ('raise OSError("no\\nlicence")', 'cannot be loaded: OSError: no licence'),
     'exits': ('raise SystemExit(0)', 'cannot be loaded: SystemExit: 0'),
     'empty': ('', "cannot be loaded: AttributeError: module 'provider_"),
     'law-only': ('def CONTROLLER(): pass', 'must be a Controller, got <function CONTROLLER at'),
@@ -175,9 +175,9 @@ def test_advice_is_logged_and_its_failure_does_no_harm(lockstep, capfd):
 @pytest.mark.parametrize(
     ('law', 'words'),
     [
-        (lambda *_: 1.0 / 0.0, "controller 'my_law' failed: ZeroDivisionError: float division"),
+        (lambda *_: 1.0 / 0.0, "controller 'my_law' failed: ZeroDivisionError"),
         (lambda *_: (math.nan, 0.0), 'two finite numbers, got (nan, 0.0)'),
-        (lambda *_: (1.0, 2.0, 3.0), 'must return (v, omega), two finite numbers, got (1.0, 2.0, 3.0)'),
+        (lambda *_: (1.0, 2.0, 3.0), 'must return (v, omega), two finite numbers'),
         (lambda *_: 0.5, 'two finite numbers, got 0.5'),
         (lambda *_: ([1.0], [2.0]), 'two finite numbers, got'),
         (lambda *_: ('1', None), 'two finite numbers, got'),
@@ -210,7 +210,7 @@ def test_a_law_that_fails_stops_the_robot_and_aborts_the_goal(lockstep, capfd):
     assert topics.statuses[-1] == SUCCEEDED
 
 
-def test_gains_are_passed_in_the_order_of_the_controller_and_numbers_of_any_kind_returned():
+def test_gains_are_passed_in_order_and_numbers_of_any_kind_returned():
     parameters = GoToGoalParameters(kp=2.0, kv=3.0, offset=5.0)
     own = replace(MINE, gains=(OFFSET, KP, KV), law=lambda pose, goal, d, kp, kv: (d, kp - kv))
     assert own.values(parameters) == (5.0, 2.0, 3.0)

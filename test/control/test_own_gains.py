@@ -1,4 +1,4 @@
-"""Laws with gains and a state of their own: the examples of doc/controllers.md driven and swept."""
+"""Laws with gains and a state of their own: the examples of doc/controllers.md."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_gains_of_an_installed_controller_are_parameters_from_the_start(lockstep
         make(GoToGoal, controller='polar', k_rho=-1.0)
 
 
-def test_gains_are_declared_when_their_controller_is_chosen_in_one_change(lockstep, site, monkeypatch):
+def test_gains_are_declared_with_their_controller_in_one_change(lockstep, site, monkeypatch):
     site.install('polar')
     node, changes = lockstep.add(make(GoToGoal, k_rho=0.7, k_alpha=-1.0)), []
     react = node.parameters_changed
@@ -78,7 +78,7 @@ def test_the_default_of_a_shared_gain_is_that_of_the_controller_chosen():
 
 def test_a_gain_cannot_take_a_name_that_the_node_uses_or_another_range(lockstep):
     """The parameter keeps its range when the controller is changed."""
-    used = ('odom_timeout', 'limits', 'check', 'at_start', 'linear_x_max_velocity', 'use_sim_time')
+    used = ('odom_timeout', 'limits', 'at_start', 'linear_x_max_velocity', 'use_sim_time')
     refused = [(Gain(name=one, default=1.0), f"'{one}', a name that go_to_goal uses") for one in used]
     for gain in (
         Gain(name='kp', default=-2.0, bounds=(-10.0, 0.0)),
@@ -124,9 +124,7 @@ def test_three_gains_are_swept_two_at_a_time_and_drawn():
     assert 'defaults: k_rho 0.5, k_alpha 2' in texts
 
 
-def test_an_installed_controller_is_swept_by_the_tool_also_with_a_gain_named_as_an_option(
-    site, tmp_path, monkeypatch
-):
+def test_the_tool_sweeps_a_gain_that_is_named_as_an_option(site, tmp_path, monkeypatch):
     site.install('polar', EXAMPLES['polar'].replace("'k_rho'", "'grid'"))
     monkeypatch.chdir(tmp_path)
     arguments = ('--gain-grid', '0.3', '0.6', '--k_beta', ' -0.8', ' -0.2', '--k_alpha', '2')
@@ -137,6 +135,16 @@ def test_an_installed_controller_is_swept_by_the_tool_also_with_a_gain_named_as_
     header, *rows = (tmp_path / 'a.csv').read_text().splitlines()
     assert header.startswith('grid_per_s,k_beta_per_s,')
     assert len(rows) == 4
+
+
+def test_a_driven_point_is_swept_with_its_offset():
+    gains = {'kv': (0.5, 1.0), 'offset': (-0.3, -0.2)}
+    swept = sweep(SweepSetup(controller='offset_point', gains=gains, grid=2, starts=2, rate=20.0))
+    assert swept.complete.all()
+    x, y, _ = np.moveaxis(swept.outcomes.pose, -1, 0)
+    # The axle comes to rest beside the goal: rows are offsets.
+    assert np.hypot(x, y)[0] == pytest.approx(0.3, abs=0.021)
+    assert np.hypot(x, y)[1] == pytest.approx(0.2, abs=0.021)
 
 
 def test_what_cannot_be_swept_is_refused():
@@ -169,7 +177,7 @@ def clock():
     return own
 
 
-def test_a_state_is_kept_during_a_goal_also_when_a_gain_changes_and_reset_for_the_next(lockstep, clock):
+def test_a_state_is_kept_when_a_gain_changes_and_reset_for_the_next_goal(lockstep, clock):
     node = lockstep.add(GoToGoal(controller=clock.controller))
     lockstep.add(make(VirtualRobot))
     lockstep.publish('goal_pose', goal(1.0, 0.0))

@@ -1,4 +1,4 @@
-"""The laws of paths: what their papers prove of them, symmetry, and robots that follow paths by them."""
+"""The laws of paths: what their papers prove of them, and robots that follow paths by them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Paths by a text: shapes of the right size, files of poses, and what is wrong with a bad file."""
+"""Paths by a text: shapes, files of poses, and bad files."""
 
 from __future__ import annotations
 

@@ -14,8 +14,9 @@ import pytest
 from support.lockstep_nodes import Controller
 from support.ros_messages import goal
 
-from diffdrive_jacobian.control import find_controller
+from diffdrive_jacobian.control import VelocityLimits, find_controller, go_to_pose
 from diffdrive_jacobian.control.goal_laws import by_shorter_turn
+from diffdrive_jacobian.simulation import closed_loops
 
 
 @pytest.fixture
@@ -54,6 +55,22 @@ def test_the_slope_is_the_largest_that_the_yaw_rate_has_over_the_heading(name):
 
 
 @pytest.mark.parametrize(
+    ('name', 'kp', 'limits', 'words'),
+    [
+        ('go_to_goal', 0.5, VelocityLimits(), ['choose kp > kv']),
+        ('go_to_goal', 0.6, VelocityLimits(), []),
+        ('pose', 1.0, VelocityLimits(), ['choose kp > 2 kv']),
+        ('pose', 1.1, VelocityLimits(), []),
+        ('offset_point', 0.1, VelocityLimits(min_v=0.0), ['may not back up']),
+        ('offset_point', 0.1, VelocityLimits(), []),
+    ],
+)
+def test_gains_and_limits_that_do_not_suit_a_law_are_warned_about(name, kp, limits, words):
+    warnings = find_controller(name).warnings(SimpleNamespace(kp=kp, kv=0.5), limits)
+    assert [word in one for word, one in zip(words, warnings, strict=True)] == [True] * len(words)
+
+
+@pytest.mark.parametrize(
     ('name', 'kp', 'kv', 'turns', 'warned'),
     [
         ('go_to_goal', 45.0, 4.5, False, False),
@@ -78,6 +95,13 @@ def test_by_shorter_turn_the_next_heading_is_the_same():
     slow = np.abs(omega) < 270.0
     assert np.array_equal(found[slow], omega[slow])
     assert by_shorter_turn(314.0, rate) == pytest.approx(314.0 - math.tau * rate)
+
+
+def test_weights_with_which_it_would_turn_once_per_sample_for_ever_arrive():
+    starts = np.random.default_rng(2).uniform([-3.0, -3.0, -3.0], 3.0, (10, 3))
+    starts[0] = 2.6080, 1.8942, 2.0064
+    h = np.array([[100.0], [215.0]])
+    assert closed_loops(go_to_pose, starts, [0.0, 0.0, 0.0], 5.0, 1.0, h).arrived.all()
 
 
 def test_the_node_makes_no_whole_turns(lockstep):

@@ -1,4 +1,4 @@
-"""Saturation keeps the curvature: the largest common factor on v and omega that meets every limit."""
+"""Saturation keeps the curvature and meets every limit."""
 
 from __future__ import annotations
 
@@ -34,10 +34,9 @@ def fastest_wheel(v, omega):
 
 def violates(limits, v, omega):
     """Return which twists break a limit, without any tolerance."""
-    body = (
-        (v < limits.min_v) | (v > limits.max_v) | (omega < limits.min_omega) | (omega > limits.max_omega)
-    )
-    return body | (fastest_wheel(v, omega) > limits.max_wheel_speed)
+    beyond = (v < limits.min_v) | (v > limits.max_v)
+    beyond |= (omega < limits.min_omega) | (omega > limits.max_omega)
+    return beyond | (fastest_wheel(v, omega) > limits.max_wheel_speed)
 
 
 def test_the_curvature_is_kept_and_no_larger_factor_meets_the_limits():
@@ -76,7 +75,7 @@ def test_a_limit_of_zero_forbids_a_direction_and_leaves_the_rest(name):
     assert np.array_equal(limited, saturate(*dropped, VelocityLimits(max_wheel_speed=20.0), R, L))
 
 
-def test_numbers_of_any_size_are_within_their_limits_to_the_last_bit_alone_and_in_a_batch():
+def test_numbers_of_any_size_are_within_their_limits_alone_and_in_a_batch():
     rng, count = np.random.default_rng(10), 6_000
     drawn = 10.0 ** rng.uniform(-60.0, 60.0, (6, count))
     drawn[:, ::7] = np.exp(rng.uniform(-4.0, 4.0, drawn[:, ::7].shape))
@@ -106,18 +105,21 @@ def test_an_invalid_limit_is_named():
         VelocityLimits(max_wheel_speed=0.0)
 
 
-def test_limits_and_commands_that_do_not_fit_together_are_named():
-    for limits, v, arguments, message in (
-        (VelocityLimits(max_v=np.ones(2)), np.ones(3), (R, L), r'leading axes .*\(3,\).*\(2,\)'),
-        (VelocityLimits(max_wheel_speed=1.0), 1.0, (0.0, L), '^r must be positive'),
-        (VelocityLimits(max_wheel_speed=1.0), 1.0, (R, -L), '^L must be positive'),
-        (VelocityLimits(max_wheel_speed=1.0), 1.0, (R,), 'max_wheel_speed, so r and L must be given'),
-        (VelocityLimits(max_wheel_speed=1.0), 1.0, (None, L), 'so r and L must be given'),
-        (VelocityLimits(max_wheel_speed=1.0), 1e308, (1e-3, 16.0), 'finite'),
-        (VelocityLimits(max_wheel_speed=1.0), [1e308, 0.0], (1e-3, 16.0), 'finite'),
-    ):
-        with pytest.raises(ValueError, match=message):
-            saturate(v, 1.0, limits, *arguments)
+@pytest.mark.parametrize(
+    ('v', 'limits', 'wheels', 'message'),
+    [
+        (np.ones(3), {'max_v': np.ones(2)}, (R, L), r'leading axes .*\(3,\).*\(2,\)'),
+        (1.0, {'max_wheel_speed': 1.0}, (0.0, L), '^r must be positive'),
+        (1.0, {'max_wheel_speed': 1.0}, (R, -L), '^L must be positive'),
+        (1.0, {'max_wheel_speed': 1.0}, (R,), 'max_wheel_speed, so r and L must be given'),
+        (1.0, {'max_wheel_speed': 1.0}, (None, L), 'so r and L must be given'),
+        (1e308, {'max_wheel_speed': 1.0}, (1e-3, 16.0), 'finite'),
+        ([1e308, 0.0], {'max_wheel_speed': 1.0}, (1e-3, 16.0), 'finite'),
+    ],
+)
+def test_limits_and_commands_that_do_not_fit_together_are_named(v, limits, wheels, message):
+    with pytest.raises(ValueError, match=message):
+        saturate(v, 1.0, VelocityLimits(**limits), *wheels)
 
 
 def test_wheels_of_different_radii_do_not_exceed_their_limit_by_the_last_bit():

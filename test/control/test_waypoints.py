@@ -30,7 +30,7 @@ def echo(pose, goal):
 
 
 def drive(arrival):
-    """Close the loop; return the poses, the waypoints driven to at each of them, and the last pose."""
+    """Return the poses, the waypoints driven to at each of them, and the last pose."""
     waypoints, pose, history = Waypoints(POSES), np.zeros(3), []
     for _ in range(2_000):
         waypoints, command = waypoints.follow(pose, law, arrival, GAIN)
@@ -55,7 +55,7 @@ def test_waypoints_are_reached_in_order_and_the_heading_only_when_it_counts():
     turned, end = drive(WITH_HEADING)
     assert abs(wrap_angle(end[2] - POSES[-1, 2])) <= 0.01
     # Up to the last position both drive alike; from there on nothing but the heading changes.
-    assert [pose.tolist() for pose, _ in turned[: len(driven)]] == [pose.tolist() for pose, _ in driven]
+    assert all(np.array_equal(one[0], other[0]) for one, other in zip(driven, turned, strict=False))
     turning = turned[len(driven) :]
     assert turning
     assert all(waypoints.turning and waypoints.index == 2 for _, waypoints in turning)
