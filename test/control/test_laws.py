@@ -26,7 +26,7 @@ COUNT = 2_000
 
 
 def random_poses(seed, count=COUNT, size=3.0):
-    """Starts and goals that have nothing to do with each other, shape (2, count, 3)."""
+    """Return independent starts and goals, shape (2, count, 3)."""
     box = [size, size, np.pi]
     return np.random.default_rng(seed).uniform(np.negative(box), box, (2, count, 3))
 
@@ -37,11 +37,11 @@ def random_gains(seed, count=COUNT, names=2):
 
 
 def polar(states, targets):
-    """Distance, bearing seen from the robot, the same seen from the goal's heading (all independent)."""
-    way = (targets[..., 0] - states[..., 0]) + 1j * (targets[..., 1] - states[..., 1])
-    alpha = np.angle(way * np.exp(-1j * states[..., 2]))
-    phi = np.angle(way * np.exp(-1j * targets[..., 2]))
-    return np.abs(way), alpha, phi
+    """Return distance, bearing from the robot's heading, and that from the goal's heading."""
+    direct = (targets[..., 0] - states[..., 0]) + 1j * (targets[..., 1] - states[..., 1])
+    alpha = np.angle(direct * np.exp(-1j * states[..., 2]))
+    phi = np.angle(direct * np.exp(-1j * targets[..., 2]))
+    return np.abs(direct), alpha, phi
 
 
 def point(poses, d):

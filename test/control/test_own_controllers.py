@@ -173,19 +173,22 @@ def test_advice_is_logged_and_its_failure_does_no_harm(lockstep, capfd):
 
 
 @pytest.mark.parametrize(
-    ('law', 'words'),
+    ('state', 'law', 'words'),
     [
-        (lambda *_: 1.0 / 0.0, "controller 'my_law' failed: ZeroDivisionError"),
-        (lambda *_: (math.nan, 0.0), 'two finite numbers, got (nan, 0.0)'),
-        (lambda *_: (1.0, 2.0, 3.0), 'must return (v, omega), two finite numbers'),
-        (lambda *_: 0.5, 'two finite numbers, got 0.5'),
-        (lambda *_: ([1.0], [2.0]), 'two finite numbers, got'),
-        (lambda *_: ('1', None), 'two finite numbers, got'),
+        ((), lambda *_: 1.0 / 0.0, "'my_law' failed: ZeroDivisionError"),
+        ((), lambda *_: (math.nan, 0.0), 'two finite numbers, got (nan, 0.0)'),
+        ((), lambda *_: (1.0, 2.0, 3.0), 'must return (v, omega), two'),
+        ((), lambda *_: 0.5, 'two finite numbers, got 0.5'),
+        ((), lambda *_: ([1.0], [2.0]), 'two finite numbers, got'),
+        ((), lambda *_: ('1', None), 'two finite numbers, got'),
+        ((1.0,), lambda *_, **__: (0.0, 0.0), 'and the state, shape (1,), got (0.0, 0.0)'),
+        ((1.0,), lambda *_, **__: (0.0, 0.0, [1.0, 2.0]), 'and the state'),
+        ((1.0,), lambda *_, **__: (0.0, 0.0, [math.nan]), 'and the state'),
     ],
 )
-def test_a_law_that_fails_is_an_error_with_its_cause(law, words):
+def test_a_law_that_fails_is_an_error_with_its_cause(state, law, words):
     with pytest.raises(LawError, match=re.escape(words)) as caught:
-        replace(MINE, law=law).bind(GoToGoalParameters())(np.zeros(3), np.ones(3))
+        replace(MINE, law=law, state=state).bind(GoToGoalParameters())(np.zeros(3), np.ones(3))
     assert isinstance(caught.value.__cause__, ZeroDivisionError) == ('Zero' in words)
 
 

