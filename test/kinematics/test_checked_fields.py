@@ -126,8 +126,7 @@ def test_checks_that_need_no_numpy(check, valid, invalid, allowed):
     for value in valid:
         assert check('x', value) == value
     for value in invalid:
-        got = 'an object of class int' if value == 10**5000 else repr(value)
-        with pytest.raises(ValueError, match=f'^{re.escape(f"x must be {allowed}, got {got}")}$'):
+        with pytest.raises(ValueError, match=f'^{re.escape(f"x must be {allowed}, got {value!r}")}$'):
             check('x', value)
 
 

@@ -179,7 +179,6 @@ def test_weights_say_what_matters_where_not_all_can_be_had():
         m = np.array([1.0, 1.0, weight])
         result = task.solve(target, [0.5, 0.5], mask=m)
         e = pose_difference(target, TWO.forward_kinematics(result.q))
-        assert not result.converged
         assert result.error == pytest.approx(math.sqrt(e @ np.diag(m) @ e))
         downhill = TWO.jacobian(result.q, heading=True).T @ (m * e)
         assert np.abs(downhill).max() < 1e-5 * result.error * max(1.0, math.sqrt(weight))
