@@ -1,4 +1,4 @@
-"""Closed loops in batches compared with one robot in a scalar loop, and robots that get lost."""
+"""Closed loops in batches compared with robots of the nodes, and robots that get lost."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_starts_gains_robots_limits_and_offsets_broadcast():
     assert len(np.unique(found.control_cost)) > 10
 
 
-def test_neither_order_nor_block_size_matters_and_steps_are_reported_in_every_block(monkeypatch):
+def test_neither_order_nor_block_size_matters_and_steps_are_reported(monkeypatch):
     starts, targets = random_batch(6, 5)
     Kp, arrival = np.linspace(6.0, 12.0, 5), Arrival(use_heading=True)
 
@@ -178,7 +178,7 @@ def test_who_never_arrives_has_no_time_and_is_where_the_time_ran_out():
     found = closed_loops(lambda pose, to: (0.1, 0.0), np.zeros((3, 3)), targets, duration=10.0)
     assert found.arrived.tolist() == [True, False, False]
     assert_allclose(found.time, [4.8, np.nan, np.nan])
-    assert_allclose(found.pose, [[0.48, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]], atol=1e-12)
+    assert_allclose(found.pose[:, 0], [0.48, 1.0, 1.0])
 
 
 def test_a_law_that_diverges_has_not_arrived_and_leaves_its_company_alone():
@@ -247,8 +247,9 @@ def test_a_law_that_returns_something_else_is_named():
         *((math.nan, 0.0), (0.0, math.inf), (np.array([0.0, np.nan]), 0.0)),
     ):
         for limits in (FREE, LIMITS):
+            arguments = (lambda *_, twist=twist: twist), np.zeros((2, 3)), [1, 0]
             with pytest.raises(ValueError, match=r'^law must .*got'):
-                closed_loops(lambda *_, twist=twist: twist, np.zeros((2, 3)), [1, 0], limits=limits)
+                closed_loops(*arguments, limits=limits)
 
 
 @pytest.mark.parametrize('drive', [closed_loops, trajectories])

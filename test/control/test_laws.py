@@ -1,7 +1,4 @@
-"""The laws of goals: document A's, document B's offset point, Aicardi's of poses (1995).
-
-What their sources prove of them, pose by pose, and what becomes of many robots that they drive.
-"""
+"""The laws of goals: document A's, document B's offset point, Aicardi's of poses (1995)."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ BROKEN = {
     'raises': ('raise OSError("no\\nlicence")', 'cannot be loaded: OSError: no licence'),
     'exits': ('raise SystemExit(0)', 'cannot be loaded: SystemExit: 0'),
     'empty': ('', "cannot be loaded: AttributeError: module 'provider_"),
-    'law-only': ('def CONTROLLER(): pass', 'must be a Controller, got <function CONTROLLER at'),
+    'law-only': ('def CONTROLLER(): pass', 'must be a Controller, got <function'),
     'misnamed': (EXAMPLES['my_law'], "name of its entry point, 'misnamed', got 'my_law'"),
     'invalid': (EXAMPLES['my_law'].replace('summary', 'gains'), 'ValueError: gains must be a tuple'),
 }

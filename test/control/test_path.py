@@ -60,7 +60,7 @@ def test_the_path_goes_through_the_poses_with_one_tangent():
 
 
 def curve(rng, ratio):
-    """Unevenly spaced positions on a curve, their arc lengths, and its curvature `sin(2 s)`."""
+    """Return uneven positions on a curve of curvature `sin(2 s)`, and their arc lengths."""
     s = np.concatenate([[0.0], np.cumsum(0.1 * rng.uniform(1.0, ratio, 60))])
     fine = np.linspace(0.0, s[-1], 100_001)
     # The integral of the curvature, and that of its direction by the trapezoidal rule.
@@ -168,7 +168,8 @@ def test_a_trajectory_keeps_its_times_and_its_pauses():
         here = path.at_time(at)
         assert (here.s, here.v, here.omega) == pytest.approx((0.4 * at, 0.4, 0.4))
         assert math.hypot(here.ax, here.ay) == pytest.approx(0.16)
-    assert path.at_time(99.0)[:5] == pytest.approx((math.sin(1.5), 1 - math.cos(1.5), 1.5, 0.0, 0.0))
+    end = math.sin(1.5), 1.0 - math.cos(1.5), 1.5
+    assert path.at_time(99.0)[:5] == pytest.approx((*end, 0.0, 0.0))
     paused = Path([(0, 0), (1, 0), (1, 0), (2, 0.5)], [0, 2, 3, 5])
     assert paused.at_time(2.5)[:5] == pytest.approx((*paused.poses_at(paused.arc_lengths[1]), 0.0, 0.0))
     speeds = [paused.at_time(at).v for at in np.linspace(0.0, 5.0, 100)]

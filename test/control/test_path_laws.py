@@ -199,8 +199,8 @@ def test_settings_do_not_change_the_look_ahead_of_the_law():
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [
-        ({'controller': find_controller('pose')}, 'controller must be of class PathController'),
-        ({'controller': 'pose'}, "path_controller must be one of .* got 'pose', a law of goals"),
+        ({'controller': find_controller('pose')}, 'must be of class PathController'),
+        ({'controller': 'pose'}, "must be one of .* got 'pose', a law of goals"),
         ({'path': [[0, 0], [1, 0]]}, 'path must be of class Path'),
         ({'rate': 0.0}, r'rate must be in \(0, 1000000000\] Hz'),
         ({'gains': {'k_y': math.nan}}, 'k_y must be in'),
