@@ -167,6 +167,7 @@ def test_advice_is_logged_and_its_failure_does_no_harm(lockstep, capfd):
     assert 'kp 3 with 1000 m/s' in capfd.readouterr().err
     assert change(node, kp=6.0).successful
     assert "the advice of controller 'my_law' failed: KeyError: 'kp'" in capfd.readouterr().err
+    assert MINE.warnings(GoToGoalParameters(), node.parameters.limits()) == []
     failing = replace(MINE, slope=lambda gains: 1.0 / 0.0)
     (warning,) = failing.rate_warnings(GoToGoalParameters(), 50.0, turns=False)
     assert "the slope of controller 'my_law' failed: ZeroDivisionError" in warning

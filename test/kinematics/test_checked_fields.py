@@ -22,6 +22,7 @@ from diffdrive_jacobian.numerics.checks import (
     Names,
     NotNegative,
     Positive,
+    Probability,
     between,
     boolean,
     instance,
@@ -49,6 +50,7 @@ class Several(Base):
     goals: Names = ('a',)
     pairs: Annotated[int | None, optional(partial(integer, low=4))] = None
     limits: VelocityLimits | None = None
+    share: Probability = 0.5
     exact: bool = False
     free: object = None
 
@@ -79,6 +81,7 @@ def test_fields_are_converted():
         ({'goals': ['odom', '']}, r"goals must be a list or tuple of names, got \['odom', ''\]"),
         ({'limits': 1.0}, 'limits must be of class VelocityLimits, got 1.0'),
         ({'exact': 1}, 'exact must be True or False, got 1'),
+        ({'share': 1.5}, r'share must be in \[0, 1\], got 1.5'),
         ({'pairs': 3}, 'pairs must be an integer of at least 4, got 3'),
     ],
 )
