@@ -270,7 +270,7 @@ def test_invalid_gains_and_options_are_named(drive, name, gains, options):
         drive(go_to_goal, np.zeros((2, 3)), [1.0, 0.0], *gains, **options)
 
 
-def test_an_unknown_option_is_an_error_of_the_function_that_was_called():
+def test_an_unknown_option_is_a_type_error():
     with pytest.raises(TypeError, match=r"^trajectories\(\) got an unexpected .* 'rat'"):
         trajectories('go_to_goal', [0.0, 0.0, 0.0], [1.0, 0.0], rat=3.0)
 

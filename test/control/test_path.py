@@ -100,7 +100,7 @@ def test_the_figure_eight_is_the_lemniscate():
 
 
 def test_positions_that_creep_are_one_position():
-    """As those of a robot that stands: each is near the one before."""
+    """As those of a robot that stands."""
     for positions in (
         [(0, 0), (0.9e-6, 0), (1.8e-6, 0), (0, 0), (1, 0)],
         [(0, 0), (1, 0), (1, 0.9e-6), (1, 1.8e-6), (1, 0), (2, 0)],

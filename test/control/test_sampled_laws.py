@@ -65,7 +65,7 @@ def test_the_slope_is_the_largest_that_the_yaw_rate_has_over_the_heading(name):
         ('offset_point', 0.1, VelocityLimits(), []),
     ],
 )
-def test_gains_and_limits_that_do_not_suit_a_law_are_warned_about(name, kp, limits, words):
+def test_gains_and_limits_that_do_not_suit_are_warned_about(name, kp, limits, words):
     warnings = find_controller(name).warnings(SimpleNamespace(kp=kp, kv=0.5), limits)
     assert [word in one for word, one in zip(words, warnings, strict=True)] == [True] * len(words)
 
@@ -81,7 +81,7 @@ def test_gains_and_limits_that_do_not_suit_a_law_are_warned_about(name, kp, limi
         ('offset_point', 3.0, 55.0, True, True),
     ],
 )
-def test_a_slope_or_a_turn_that_is_not_below_the_rate_is_warned_about(name, kp, kv, turns, warned):
+def test_a_slope_that_is_not_below_the_rate_is_warned_about(name, kp, kv, turns, warned):
     gains = SimpleNamespace(kp=kp, kv=kv)
     warnings = find_controller(name).rate_warnings(gains, 50.0, turns=turns)
     assert ['not below the odometry rate of 50 Hz' in one for one in warnings] == [True] * warned
