@@ -16,7 +16,7 @@ from support.bags import REAL
 from support.lockstep_nodes import change
 from support.lockstep_nodes import make_complete as make
 from support.recorded import recorded
-from support.ros_messages import goal, goals, placement, twist, twist_stamped
+from support.ros_messages import goal, goals, placement, twist
 from support.runs import built_run, series
 
 from diffdrive_jacobian.bags import BagError, read_run
@@ -186,26 +186,6 @@ def test_placements_resets_timeouts_and_parameters_are_driven_again(
     assert (verification.truth is not None) == slip
 
 
-def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(robot_at, driven):
-    robot_at(
-        linear__x__max_acceleration=0.5,
-        linear__x__max_deceleration=-0.8,
-        angular__z__max_acceleration=2.0,
-        wheel_lag=0.1,
-        command_delay=0.05,
-        max_wheel_acceleration=20.0,
-    )
-    run = driven(((0.5, 1.0), (-0.3, 1.0), (0.4, -2.0), (0.0, 0.0), (0.3, 0.3)), 0.23, rest=0.6)
-    verification = verified(run, 1e-12)
-    assert (verification.source, verification.start) == ('cmd_vel_out', 'start_pose')
-    assert verification.covariance_difference <= COVARIANCE_TOLERANCE
-    without = verify(replace(run, parameters={}))
-    assert without.distances.max() > 0.01
-    assert 'cannot be reproduced without them' in without.notes[-1]
-    with pytest.raises(BagError, match=r'it lacks start_pose .* does not come to a known state'):
-        verify(kept(run, start_pose=NOTHING))
-
-
 def test_changes_of_the_dynamics_are_driven_again(lockstep, robot_at, recording, command):
     robot = robot_at(linear__x__max_acceleration=0.4, command_delay=0.13)
     with recording() as made:
@@ -228,13 +208,16 @@ def test_changes_of_the_dynamics_are_driven_again(lockstep, robot_at, recording,
             command(v, -0.5, 0.1)
     run = made.run
     assert len(run.parameter_events) >= 12
-    verified(run, 1e-12)
+    verification = verified(run, 1e-12)
+    assert (verification.source, verification.start) == ('cmd_vel_out', 'start_pose')
     assert verify(replace(run, parameter_events=())).distances.max() > 0.01
+    without = verify(replace(run, parameters={}, parameter_events=()))
+    assert without.distances.max() > 0.01
+    assert 'cannot be reproduced without them' in without.notes[-1]
 
 
-@pytest.mark.parametrize('limits', [{}, {'linear__x__max_acceleration': 0.5, 'wheel_lag': 0.05}])
-def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, driven, limits):
-    robot_at(**limits)
+def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, driven):
+    robot_at(linear__x__max_acceleration=0.5, wheel_lag=0.05)
     lockstep.inject(
         ActuatorLag(0.2, start=0.1, duration=0.5),
         DeadWheel('left', start=0.3, duration=0.5),
@@ -252,6 +235,8 @@ def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, driven, limit
     without = verify(replace(run, fault_events=()))
     assert without.distances.max() > 0.01
     assert '/fault_events must be recorded' in without.notes[-1]
+    with pytest.raises(BagError, match=r'it lacks start_pose .* does not come to a known state'):
+        verify(kept(run, start_pose=NOTHING))
 
 
 @pytest.mark.parametrize('limits', [{}, {'linear__x__max_acceleration': 0.5}, {'simulate_slip': True}])
@@ -290,18 +275,6 @@ def test_time_that_goes_back_is_followed(lockstep, robot_at, command, tmp_path):
 def test_messages_that_are_there_twice_do_not_turn_back_time(run):
     twice = np.repeat(np.arange(len(run.odometry)), 2)
     assert len(verified(kept(run, odometry=twice)).seconds) == len(twice)
-
-
-@pytest.mark.lockstep(start=100.0)
-def test_late_stamped_commands_are_explained(lockstep, robot_at, recording):
-    robot_at(enable_stamped_cmd_vel=True)
-    with recording() as made:
-        for index in range(10):
-            lockstep.run_for(0.05)
-            late = lockstep.now - 30_000_000
-            lockstep.publish('cmd_vel', twist_stamped(0.5, (-1) ** index, late))
-    assert len(made.run.cmd_vel_out) == 10
-    verified(made.run)
 
 
 def test_placements_are_followed_by_the_time_of_recording(lockstep, robot_at, recording, command):
@@ -374,24 +347,6 @@ def test_a_start_that_does_not_fit_the_odometry_is_a_difference(lockstep, robot_
         {'odometry_covariances': np.full_like(run.odometry_covariances, 7.0)},
     ):
         assert not verify(replace(run, **changes)).agrees(EXACT, EXACT), changes
-
-
-def test_after_a_reset_of_the_odometry_alone_the_truth_has_no_known_start(
-    lockstep, robot_at, recording, command
-):
-    robot_at(simulate_slip=True, cmd_vel_timeout=0.1)
-    command(0.3, -0.7, 0.5)
-    lockstep.call(Trigger, 'reset_odometry')
-    lockstep.run_for(0.5)
-    with recording() as made:
-        lockstep.run_for(0.1)
-        command(0.1, 0.9, 0.3)
-        lockstep.publish('initialpose', PoseWithCovarianceStamped())
-        lockstep.run_for(0.1)
-    verification = verified(made.run)
-    assert (verification.start, verification.truth) == ('odometry', None)
-    assert len(made.run.start_pose) == 3
-    assert len(verification.seconds) == len(made.run.odometry)
 
 
 @pytest.mark.parametrize('missed', [1, 10])
@@ -511,31 +466,29 @@ def still(count=100, begin=10**9, step=10**8, **keywords):
 
 
 def test_runs_that_cannot_be_verified_say_why(run):
-    odometry, stamps = run.odometry, 2 * 10**18 + 10**8 * np.arange(100)
-    stopped = replace(odometry, received=0 * odometry.received)
-    shuffled = replace(odometry, stamps=odometry.stamps - 10**9 * (np.arange(len(odometry)) % 2))
-    cases = [
+    odometry, standing = run.odometry, still()
+    back = replace(odometry, stamps=odometry.stamps - 10**9 * (np.arange(len(odometry)) % 2))
+    clock_stopped = replace(odometry, received=0 * odometry.received)
+    early = series('cmd_vel', standing.stamps, np.full((100, 2), 0.5))
+    other_clock = replace(standing, received=standing.received + 10**18)
+    last = standing.stamps[-1:] + 1
+    for given, words in (
         (kept(run, odometry=NOTHING), 'no odometry'),
-        (replace(run, odometry=stopped), 'clock of the recorder stood still'),
-        (replace(run, odometry=shuffled), 'record without use_sim_time'),
+        (replace(run, odometry=clock_stopped), 'clock of the recorder stood still'),
+        (replace(run, odometry=back), 'record without use_sim_time'),
+        (kept(run, cmd_vel_out=NOTHING, cmd_vel=NOTHING), 'no commands: record cmd_vel_out, or cmd_vel'),
         (
-            kept(run, cmd_vel_out=NOTHING, cmd_vel=NOTHING),
-            'has no commands: record cmd_vel_out, or cmd_vel',
+            built_run(odometry=other_clock, cmd_vel=early),
+            'another clock than the stamps of the odometry',
         ),
-    ]
-    for ahead in (10**18, -(10**18)):
-        commands = series('cmd_vel', stamps + ahead, np.full((100, 2), 0.5))
-        late = still(begin=2 * 10**18, received=stamps + ahead)
-        of_another = built_run(odometry=late, cmd_vel=commands)
-        cases.append((of_another, 'another clock than the stamps of the odometry'))
-        applied = series('cmd_vel_out', stamps[50:] + ahead, np.full((50, 2), 0.5), stamps[50:])
-        of_another = built_run(odometry=still(begin=2 * 10**18), cmd_vel_out=applied)
-        cases.append((of_another, 'no odometry after the first command on cmd_vel_out'))
-    for topic in ('cmd_vel', 'cmd_vel_out'):
-        late = series(topic, still().stamps[-1:] + 1, [[0.5, 0.3]])
-        last = built_run(odometry=still(), **{topic: late})
-        cases.append((last, f'no odometry after the first command on {topic}'))
-    for given, words in cases:
+        *(
+            (
+                built_run(odometry=standing, **{topic: series(topic, last, [[0.5, 0.3]])}),
+                f'no odometry after the first command on {topic}',
+            )
+            for topic in ('cmd_vel', 'cmd_vel_out')
+        ),
+    ):
         with pytest.raises(BagError, match=words):
             verify(given)
 
