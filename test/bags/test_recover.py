@@ -21,7 +21,6 @@ from support.bags import REAL
 from support.raw_bags import (
     PLUGINS,
     START,
-    TOPICS,
     channel,
     contents,
     data_file,
@@ -41,8 +40,6 @@ from diffdrive_jacobian.bags.corrected_reader import zstd
 from diffdrive_jacobian.bags.journal import Message, Text
 
 pytestmark = pytest.mark.usefixtures('quick_disk')
-
-PAGE = 4096
 MESSAGES = make_messages(50, 300)
 
 
@@ -122,18 +119,7 @@ def test_files_that_are_copied_or_missing_are_reported(run, tmp_path, capsys):
     assert 'lost: metadata.yaml counts 70 messages, 50 were found' in out
 
 
-def test_a_write_ahead_log(run, tmp_path, capsys):
-    file = write_without_metadata(run, 'sqlite3')
-    more = (START + 10**9, b'\0\1\0\0more of it')
-    with closing(sqlite3.connect(file)) as database:
-        database.execute('PRAGMA journal_mode=WAL')
-        database.execute('INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)', more)
-        database.commit()
-        shutil.copytree(run, tmp_path / 'broken')
-    assert saved(capsys, tmp_path / 'broken')[1] == [*MESSAGES, ('/odom', *more)]
-
-
-def test_what_sqlite_had_not_committed_is_rolled_back_in_a_copy(run, tmp_path, capsys):
+def test_what_sqlite_had_committed_to_its_log_is_saved_and_the_rest_rolled_back(run, tmp_path, capsys):
     file = write_without_metadata(run, 'sqlite3')
     with closing(sqlite3.connect(file)) as database:
         database.execute('PRAGMA cache_size = 1')
@@ -142,22 +128,13 @@ def test_what_sqlite_had_not_committed_is_rolled_back_in_a_copy(run, tmp_path, c
     assert data_file(tmp_path / 'broken').read_bytes() != file.read_bytes()
     assert (tmp_path / 'broken' / 'run.db3-journal').stat().st_size > 0
     assert saved(capsys, tmp_path / 'broken')[1] == MESSAGES
-
-
-def test_what_a_writer_had_written_when_it_ended(run, tmp_path, capsys):
-    """A chunk of MCAP is written per MiB."""
-    messages, size, ended_at = make_messages(1_500, 7_000), 7_000, 1_000
-
-    def copy(count):
-        if count == ended_at:
-            shutil.copytree(run, tmp_path / 'broken')
-
-    write_bag(run, 'mcap', messages, told=copy)
-    _, found = saved(capsys, tmp_path / 'broken')
-    rest = iter(messages[:ended_at])
-    assert all(one in rest for one in found)
-    assert len(found) >= ended_at - 2 * 2_500_000 // size
-    assert {topic for topic, _, _ in found} == set(TOPICS)
+    more = (START + 10**9, b'\0\1\0\0more of it')
+    with closing(sqlite3.connect(file)) as database:
+        database.execute('PRAGMA journal_mode=WAL')
+        database.execute('INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)', more)
+        database.commit()
+        shutil.copytree(run, tmp_path / 'logged')
+    assert saved(capsys, tmp_path / 'logged')[1] == [*MESSAGES, ('/odom', *more)]
 
 
 def test_compressed_files_are_unpacked(run, capsys):
@@ -167,18 +144,6 @@ def test_compressed_files_are_unpacked(run, capsys):
 
 
 # --- Damage with a name
-
-
-def test_the_end_of_an_sqlite_file_that_became_zeros(run, capsys):
-    messages = make_messages(100, 1000)
-    file = write_without_metadata(run, 'sqlite3', messages)
-    size = file.stat().st_size
-    left = 2 * size // 3 // PAGE * PAGE
-    edit(file, lambda data: data.__setitem__(slice(left, size), bytes(size - left)))
-    out, found = saved(capsys, run)
-    assert 'lost: run.db3: SQLite refuses the rest: database disk image is malformed' in out
-    assert found == messages[: len(found)]
-    assert len(found) > 40
 
 
 @pytest.mark.parametrize(('name', 'compress'), [('lz4', lz4.frame.compress), ('zstd', zstd.compress)])
@@ -192,12 +157,12 @@ def test_cuts_in_a_compressed_chunk(run, tmp_path, capsys, name, compress):
     packed = compress(content)
     chunk = struct.pack('<QQQII', start, end, size, zlib.crc32(content), len(name)) + name.encode()
     chunk += struct.pack('<Q', len(packed)) + packed
-    for part in (0.0, 0.7, 1.0):
+    for part in (0.7, 1.0):
         left = int(part * len(packed)) + len(chunk) - len(packed)
         broken = tmp_path / f'{part}.mcap'
         broken.write_bytes(data[:head] + struct.pack('<BQ', 6, len(chunk)) + chunk[:left])
-        code, _, _ = recover(capsys, broken, '-o', tmp_path / f'{part}')
-        found = read_bag(tmp_path / f'{part}') if code == 0 else []
+        assert recover(capsys, broken, '-o', tmp_path / f'{part}')[0] == 0
+        found = read_bag(tmp_path / f'{part}')
         assert found == messages[: len(found)]
         assert len(found) >= (part * size - 150_000) / 1500
 
@@ -217,17 +182,11 @@ def test_a_journal(tmp_path, capsys, given):
     assert contents(tmp_path) == before
 
 
-def test_a_journal_without_the_name_of_a_bag(run, tmp_path, capsys):
-    write_journal(run, MESSAGES).rename(tmp_path / '.journal.mcap')
-    code, out, _ = recover(capsys, tmp_path / '.journal.mcap')
-    assert (code, '.journal_recovered is written' in out) == (0, True)
-
-
 def test_an_empty_journal_can_be_deleted(run, tmp_path, capsys):
     write_journal(run, [])
     code, out, err = recover(capsys, run)
     assert (code, out) == (1, '')
-    assert 'holds no message that can be saved: the recording ended before one was received' in err
+    assert 'the recording ended before one was received, so it can be deleted' in err
     assert os.listdir(tmp_path) == ['run.journal.mcap']
 
 
@@ -295,7 +254,7 @@ def test_a_bag_without_checksums_cannot_be_called_complete(run, capsys, storage)
 
 
 @pytest.mark.parametrize(
-    ('opcode', 'place', 'said'),
+    ('opcode', 'place', 'words'),
     [
         (Opcode.STATISTICS, 9 + 46 + 2, 'its statistics count '),
         (Opcode.STATISTICS, 9 + 46 + 2, 'the checksum of its summary is wrong'),
@@ -303,27 +262,17 @@ def test_a_bag_without_checksums_cannot_be_called_complete(run, capsys, storage)
         (Opcode.CHUNK, 200, 'a chunk of '),
     ],
 )
-def test_one_byte_is_noticed(ours, capsys, opcode, place, said):
+def test_one_byte_is_noticed(ours, capsys, opcode, place, words):
     def alter(data):
         data[next(start for one, start, _ in mcap_records(data) if one == opcode) + place] ^= 1
 
     edit(ours / 'run.mcap', alter)
     for what in (ours, ours / 'run.mcap'):
         _, out, err = recover(capsys, what, '-o', ours.parent / f'new{what.suffix}')
-        assert f'lost: run.mcap: {said}' in out or said in err
-
-
-def test_readers_refuse_an_index_with_a_wrong_checksum(ours):
-    """Another name of a topic in it would hide the messages of that topic."""
-    file, name = ours / 'run.mcap', struct.pack('<I', 5) + b'/odom'
-    assert find_damage(file) == ''
-
-    def rename(data):
-        assert data.count(name) == 2  # In the chunk and in the index.
-        data[data.rindex(name) + len(name) - 1] ^= 1
-
-    edit(file, rename)
-    assert 'the checksum of its summary is wrong' in find_damage(file)
+        assert f'lost: run.mcap: {words}' in out or words in err
+    # Readers refuse the index: another name of a topic in it would hide the messages of that topic.
+    if opcode == Opcode.STATISTICS:
+        assert 'the checksum of its summary is wrong' in find_damage(ours / 'run.mcap')
 
 
 def test_wrong_counts_are_noticed_without_checksums(run, tmp_path, capsys):
@@ -350,8 +299,6 @@ def test_what_holds_nothing_of_a_bag_and_places_that_cannot_be_written(run, tmp_
         (['nothing'], 'nothing.journal.mcap'),
         (['others'], 'holds no files of a bag but journals (*.journal.mcap)'),
         (['other'], 'holds neither .mcap nor .db3 files'),
-        # Nobody may make a directory there, not even root.
-        (['run', '-o', '/sys/new'], 'no bag was written'),
         (['run', '-o', tmp_path / 'other' / 'notes.txt' / 'new'], 'no bag was written'),
     ):
         code, out, err = recover(capsys, tmp_path / arguments[0], *arguments[1:])
