@@ -10,33 +10,22 @@ from __future__ import annotations
 import random
 import shutil
 import sqlite3
-import struct
-import zlib
 from contextlib import closing, suppress
 
 import pytest
-from mcap.opcode import Opcode
-from rclpy.serialization import serialize_message
 from rosbags.rosbag2 import CompressionMode
-from support.bags import SECOND, odom
 from support.raw_bags import (
-    LATCHED,
-    channel,
     contents,
     data_file,
     make_messages,
-    mcap_records,
     names_of,
     read_bag,
     write_bag,
     write_journal,
-    write_records,
 )
-from support.ros_messages import twist
 
 from diffdrive_jacobian.bags import BagError, NotABagError, NothingToSaveError, read_run, recover
 from diffdrive_jacobian.bags.files import MCAP_MAGIC
-from diffdrive_jacobian.bags.journal import Message, Text
 from diffdrive_jacobian.bags.recovery import Recovery, UncheckedError
 from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.bags.timeline import timeline
@@ -213,47 +202,3 @@ def test_undamaged_files_without_metadata(whole, tmp_path):
     if path.is_dir():
         assert any('there is no valid metadata.yaml' in one for one in recovery.unchecked)
         assert names_of(tmp_path / 'new') == names_of(path)
-
-
-# --- Records
-
-
-def test_records_of_journals_with_right_checksums(tmp_path):
-    written = [
-        Text('storage', 'mcap'),
-        Text('parameters of /go_to_goal', '{"kp": 3.0}'),
-        channel(0, '/odom', 'nav_msgs/msg/Odometry', (LATCHED,)),
-        channel(1, '/cmd_vel', 'geometry_msgs/msg/Twist', (LATCHED,)),
-    ]
-    for second in (1, 2, 3):
-        pose = serialize_message(odom(second, 0, 0, seconds=second))
-        written.append(Message(0, second * SECOND, pose))
-        written.append(Message(1, second * SECOND, serialize_message(twist(0.5, 0.0))))
-    whole = write_records(tmp_path / 'good', *written).read_bytes()
-    *outside, (_, chunk, end) = mcap_records(whole)
-    # After opcode, length, times, size, checksum, compression and size of a chunk.
-    inside = chunk + 49
-    chance, results = random.Random('journal'), set()
-    for number in range(10):
-        data = bytearray(whole)
-        for _ in range(chance.choice((1, 1, 2, 3))):
-            _, at, to = chance.choice([*outside, *mcap_records(whole, inside) * 2])
-            place = chance.choice((at, chance.randrange(at + 9, to)))
-            value = chance.choice((b'\0', b'\xff', b'\xed\xa0\x80', chance.randbytes(2)))
-            data[place : place + len(value)] = value
-        for opcode, at, to in outside:
-            if opcode == Opcode.ATTACHMENT:
-                data[to - 4 : to] = struct.pack('<I', zlib.crc32(data[at + 9 : to - 4]))
-        data[chunk + 33 : chunk + 37] = struct.pack('<I', zlib.crc32(data[inside:end]))
-        path = tmp_path / f'{number}' / 'run.journal.mcap'
-        path.parent.mkdir()
-        path.write_bytes(data)
-        run, recovery = check(path, path.with_name('new'))
-        assert isinstance(run, BagError)
-        if isinstance(recovery, Recovery):
-            # The new bag can be read, and is complete unless a definition cannot be parsed.
-            read_run(recovery.bag)
-            with suppress(NothingToSaveError):
-                assert recover(recovery.bag, path.with_name('again')).topics_left_out
-        results.add(isinstance(recovery, Recovery))
-    assert results == {True, False}

@@ -21,13 +21,12 @@ from support.ros_messages import (
     twist,
     twist_stamped,
 )
-from support.runs import built_run, sample, series
+from support.runs import sample
 
 from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.bags.run import COLUMNS
-from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.errors import InterruptionError
 from diffdrive_jacobian.messages.codecs import FaultEvent
@@ -107,16 +106,6 @@ def test_messages_that_the_nodes_drop_are_left_out_and_counted(tmp_path):
     assert {note.removeprefix('1 of 1 messages on ') for note in run.notes} == {
         f'{topic} hold invalid or implausible values and were skipped' for topic in sent
     }
-
-
-def test_wheel_speeds_and_waypoints_are_plausible_up_to_a_limit(tmp_path):
-    sent = [(3.0, '/goals', goals(*[goal(1.0, 0.0)] * MAX_WAYPOINTS))]
-    for speed in (1e6, -1e6):
-        sent.append((1.0, '/joint_states', joint_command(speed, 0)))
-        sent.append((2.0, '/joint_states', joint_command(0, math.nextafter(speed, 2.0 * speed))))
-    run = read_run(write_bag(tmp_path / 'bag', sent))
-    assert run.wheels.values.tolist() == [[0.0, 1e6], [0.0, -1e6]]
-    assert len(run.goals) == MAX_WAYPOINTS
 
 
 def test_messages_that_cannot_be_decoded_are_skipped_and_counted(tmp_path):
@@ -201,20 +190,6 @@ def test_parameters_are_those_of_the_beginning_and_changes_come_after(tmp_path):
 
 
 # --- What follows of a run
-
-
-def test_the_goal_of_a_route_changes_at_the_message_at_which_it_is_reached():
-    n = 100
-    times = SECOND + np.arange(n) * SECOND // 10
-    values = np.zeros((n, 5))
-    values[:, 0], values[:, 3] = 0.1 * np.arange(n), 1.0
-    targets = values[1::2, :3]
-    run = built_run(
-        odometry=series('odometry', times, values),
-        goals=series('goals', np.full(len(targets), times[0]), targets),
-    )
-    expected = np.minimum(np.arange(n) // 2 + np.arange(n) % 2, len(targets) - 1)
-    np.testing.assert_array_equal(timeline(run).goal, expected)
 
 
 @pytest.mark.parametrize('calls', [0, 20])

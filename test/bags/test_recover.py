@@ -6,6 +6,7 @@ Random damage is in `test_damage_fuzz`.
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import sqlite3
 import struct
@@ -204,6 +205,21 @@ def test_losses_that_the_recorder_noted_are_reported(run, capsys):
     assert 'lost: 3 messages on /cmd_vel while it was recorded\n' in out
     assert 'lost: 12 messages on /odom while it was recorded\n' in out
     assert 'no loss was found' not in out
+
+
+def test_without_room_for_the_new_bag_the_journal_stays(run, tmp_path, capsys):
+    write_journal(run, MESSAGES)
+    before, limits = contents(tmp_path), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        code, out, err = recover(capsys, run)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert (code, out) == (1, '')
+    assert err.startswith('recover_run: error: no bag was written: ')
+    assert contents(tmp_path) == before
+    assert recover(capsys, run)[0] == 0
+    assert read_bag(run) == MESSAGES
 
 
 # --- What is checked

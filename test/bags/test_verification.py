@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache, partial
 from types import SimpleNamespace
 
@@ -21,7 +21,6 @@ from support.runs import built_run, series
 
 from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.bags.recorded_robot import start_covariances
-from diffdrive_jacobian.bags.run import Series
 from diffdrive_jacobian.bags.verification import (
     COVARIANCE_TOLERANCE,
     largest_covariance_difference,
@@ -88,13 +87,6 @@ def drives(tmp_path_factory):
             with recorded(world, tmp_path_factory.mktemp('runs') / 'run') as made:
                 world.publish('goals', goals(goal(0.5, 0.2), goal(-0.3, 0.4)))
                 world.run_for(COUNT / parameters.get('publish_rate', 50.0))
-        # Tests share it.
-        for field in fields(made.run):
-            value = getattr(made.run, field.name)
-            is_series = isinstance(value, Series)
-            for array in (value.received, value.stamps, value.values) if is_series else (value,):
-                if isinstance(array, np.ndarray):
-                    array.setflags(write=False)
         return made.run
 
     return drive
@@ -102,7 +94,7 @@ def drives(tmp_path_factory):
 
 @pytest.fixture
 def run(drives):
-    """The run of a robot without limits, which is not changed."""
+    """The run of a robot without limits. Tests share it and change copies only."""
     return drives('twist')
 
 

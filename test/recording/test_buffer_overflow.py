@@ -73,16 +73,13 @@ def test_a_process_that_was_held_may_have_missed_something(monkeypatch):
     assert watched.last == 0
 
 
-def test_the_history_is_ascending():
+def test_the_history_is_ascending_and_bounded_in_its_rate():
     times = overflow._Times()
     for stamp in (1000, 1004, 990, 10**9, 10**9 - 5):
         times.add(stamp * MILLISECOND)
     assert [*times.times] == sorted(times.times)
     assert times.within(10**9 * MILLISECOND, 10**9 * MILLISECOND)
     assert not times.within(980 * MILLISECOND, 995 * MILLISECOND)
-
-
-def test_the_history_is_bounded_in_its_rate():
     watched = Overflow(counted=False)
     for number in range(1000):
         watched.received(2 * overflow.BURST_VOLUME, number * MILLISECOND // 100)

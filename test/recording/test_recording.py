@@ -37,7 +37,6 @@ pytestmark = pytest.mark.usefixtures('quick_disk')
 
 PATIENCE = 20.0
 NEVER = threading.Event()
-STRANGE_NAMES = ('run#2', 'run?mode=memory', 'run%41', 'file:x', ':memory:', "it's ü")
 CHANNEL = channel(8, '/cmd_vel', 'geometry_msgs/msg/Twist')
 
 
@@ -50,16 +49,16 @@ def messages(count, size=40):
     ]
 
 
+def add(recording, *records):
+    for record in records:
+        recording.add(record)
+
+
 def recorded(path, *records, **options):
     """Return a recording of these records of the topic /cmd_vel."""
     recording = Recording(path, **options)
-    add_all(recording, CHANNEL, *records)
+    add(recording, CHANNEL, *records)
     return recording
-
-
-def add_all(recording, *records):
-    for record in records:
-        recording.add(record)
 
 
 def content(bag):
@@ -68,14 +67,10 @@ def content(bag):
         return [data for _, _, data in bag_reader.messages(reader, reader.connections)]
 
 
-def custom_data(bag):
-    with open_bag(bag) as reader:
-        return bag_reader.custom_data(reader)
-
-
 def losses(bag, key=LOST):
     """Return the losses that a bag notes."""
-    return json.loads(custom_data(bag)[key])
+    with open_bag(bag) as reader:
+        return json.loads(bag_reader.custom_data(reader)[key])
 
 
 def failed(recording, match):
@@ -130,20 +125,17 @@ def disk(monkeypatch):
 # --- Paths
 
 
-def test_a_bag_can_have_any_path_also_behind_a_symbolic_link(tmp_path, monkeypatch):
+@pytest.mark.parametrize('name', ['run#2', 'run?mode=memory', 'run%41', 'file:x', ':memory:', "it's ü"])
+def test_a_bag_can_have_any_path_also_behind_a_symbolic_link(tmp_path, monkeypatch, name):
     (tmp_path / 'link?').symlink_to('real#')
-    for name in STRANGE_NAMES:
-        folder = tmp_path / 'real#' / name
-        folder.mkdir(parents=True)
-        monkeypatch.chdir(tmp_path / 'link?' / name)
-        bag = Path(name)
-        assert recorded(bag, *messages(3)).finish().messages == 3
-        assert os.listdir(folder) == [str(bag)]
-        file = f'{bag}.mcap'
-        assert sorted(os.listdir(bag)) == sorted([file, 'metadata.yaml'])
-        described = YAML(typ='safe').load(bag / 'metadata.yaml')['rosbag2_bagfile_information']
-        assert described['relative_file_paths'] == [file]
-        assert content(folder / bag) == [one.data for one in messages(3)]
+    (tmp_path / 'real#').mkdir()
+    monkeypatch.chdir(tmp_path / 'link?')
+    assert recorded(Path(name), *messages(3)).finish().messages == 3
+    assert os.listdir(tmp_path / 'real#') == [name]
+    assert sorted(os.listdir(name)) == sorted([f'{name}.mcap', 'metadata.yaml'])
+    described = YAML(typ='safe').load(Path(name) / 'metadata.yaml')['rosbag2_bagfile_information']
+    assert described['relative_file_paths'] == [f'{name}.mcap']
+    assert content(tmp_path / 'real#' / name) == [one.data for one in messages(3)]
 
 
 def test_a_name_that_no_bag_can_have_is_refused_before_recording(tmp_path):
@@ -185,7 +177,7 @@ def test_a_folder_of_the_user_stays(tmp_path):
     recording = recorded(tmp_path / 'run', *messages(1))
     recording.finish()
     # Nothing is recorded after the end.
-    add_all(recording, *messages(1))
+    add(recording, *messages(1))
     assert recording.lost == {}
     assert (tmp_path / '.run.building' / 'thesis').read_text() == 'precious'
     assert sorted(os.listdir(tmp_path)) == ['.run.building', 'run']
@@ -198,7 +190,7 @@ def busy(path, disk):
     """Return a recording whose thread waits for the disk, with one message."""
     recording = Recording(path)
     disk.ready.clear()
-    add_all(recording, CHANNEL, *messages(1))
+    add(recording, CHANNEL, *messages(1))
     until(lambda: disk.writes, 'the thread writes')
     return recording
 
@@ -207,7 +199,7 @@ def test_a_slow_disk_loses_no_message_delays_no_caller_and_gets_few_writes(tmp_p
     """Each write may take a second."""
     recording = busy(tmp_path / 'run', disk)
     # All of these are taken while one write lasts.
-    add_all(recording, *messages(1_000))
+    add(recording, *messages(1_000))
     assert recording.lost == {}
     disk.ready.set()
     assert recording.finish().messages == 1_001
@@ -227,8 +219,7 @@ def test_memory_is_bounded_and_what_is_dropped_is_counted(tmp_path, disk, monkey
     (dropped,) = recording.lost.values()
     assert dropped == count - 9 if size == 100_000 else 0 < dropped < count
     disk.ready.set()
-    words = rf'{dropped} were received faster than the disk .*/cmd_vel {dropped}'
-    error = failed(recording, words)
+    error = failed(recording, rf'{dropped} were received faster than the disk .*/cmd_vel {dropped}')
     summary = error.summary
     assert (summary.messages, summary.lost) == (1 + count - dropped, {'/cmd_vel': dropped})
     assert len(content(tmp_path / 'run')) == summary.messages
@@ -236,23 +227,14 @@ def test_memory_is_bounded_and_what_is_dropped_is_counted(tmp_path, disk, monkey
     assert os.listdir(tmp_path) == ['run']
 
 
-def test_a_message_larger_than_the_memory_is_taken_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(recordings, 'CAPACITY', 1_000)
-    recording = Recording(tmp_path / 'run')
-    add_all(recording, CHANNEL)
-    until(lambda: recording.journal.waiting == 0, 'all is written')
-    add_all(recording, *messages(1, size=100_000))
-    assert recording.finish().messages == 1
-
-
 def test_a_lossless_recording_waits_for_the_disk(tmp_path, disk, monkeypatch):
     monkeypatch.setattr(recordings, 'CAPACITY', 2_000)
     recording = Recording(tmp_path / 'run', lossless=True)
-    add_all(recording, CHANNEL)
+    add(recording, CHANNEL)
     disk.ready.clear()
     release = threading.Timer(0.05, disk.ready.set)
     release.start()
-    add_all(recording, *messages(60))
+    add(recording, *messages(60))
     assert disk.ready.is_set()
     assert recording.finish().messages == 60
 
@@ -265,9 +247,9 @@ def test_a_full_disk_is_raised_by_finish(tmp_path, disk, lossless):
     recording = recorded(tmp_path / 'run', *messages(10), lossless=lossless)
     until(lambda: recording.journal.waiting == 0, 'these are written')
     disk.error = errno.ENOSPC
-    add_all(recording, *messages(20))
+    add(recording, *messages(20))
     until(lambda: recording.error is not None, 'the thread notices')
-    add_all(recording, *messages(5))
+    add(recording, *messages(5))
     error = failed(recording, 'aborted: No space left on device')
     assert str(error).endswith(f'{journal_of(tmp_path / "run")}. 25 messages are missing')
     summary = error.summary
@@ -284,40 +266,26 @@ def test_finish_raises_if_the_bag_cannot_be_written(tmp_path):
     assert (tmp_path / 'run').read_text() == 'somebody else came first'
 
 
-def replace_journal(folder):
-    journal_of(folder / 'run').unlink()
-    journal_of(folder / 'run').write_text('of somebody else')
-
-
-WAYS = {
-    'replace': replace_journal,
-    'rename': lambda folder: journal_of(folder / 'run').rename(folder / 'elsewhere.journal.mcap'),
-    'remove the folder': shutil.rmtree,
-}
-
-
-@pytest.mark.parametrize('change', WAYS)
+@pytest.mark.parametrize('change', ['replace', 'rename', 'remove the folder'])
 def test_a_journal_that_goes_is_noticed(tmp_path, change):
     folder = tmp_path / 'runs'
     folder.mkdir()
+    journal, elsewhere = journal_of(folder / 'run'), journal_of(folder / 'elsewhere')
     recording = recorded(folder / 'run', *messages(50))
-    WAYS[change](folder)
+    if change == 'remove the folder':
+        shutil.rmtree(folder)
+    else:
+        journal.rename(elsewhere)
+    if change == 'replace':
+        journal.write_text('of somebody else')
     until(lambda: recording.error is not None, 'it is noticed')
-    error = failed(recording, 'was removed, renamed or replaced')
-    assert error.summary is None
+    assert failed(recording, 'was removed, renamed or replaced').summary is None
     assert not (folder / 'run').exists()
     if change == 'replace':
-        assert journal_of(folder / 'run').read_text() == 'of somebody else'
+        assert journal.read_text() == 'of somebody else'
     elif change == 'rename':
-        recover(folder / 'elsewhere.journal.mcap')
+        recover(elsewhere)
         assert content(folder / 'elsewhere') == [one.data for one in messages(50)]
-
-
-def test_discarding_keeps_a_file_of_another_process(tmp_path):
-    recording = Recording(tmp_path / 'run')
-    replace_journal(tmp_path)
-    recording.discard()
-    assert journal_of(tmp_path / 'run').read_text() == 'of somebody else'
 
 
 def test_what_was_missed_or_left_out_is_reported_also_after_a_crash(tmp_path):
@@ -365,7 +333,15 @@ def test_all_files_are_synchronized_before_the_bag_gets_its_name(tmp_path, monke
     assert len(names) == 2
 
 
-def test_a_directory_that_cannot_be_synchronized_does_not_matter(tmp_path, monkeypatch):
+def test_discarding_keeps_a_file_of_another_process(tmp_path):
+    recording, journal = Recording(tmp_path / 'run'), journal_of(tmp_path / 'run')
+    journal.unlink()
+    journal.write_text('of somebody else')
+    recording.discard()
+    assert journal.read_text() == 'of somebody else'
+
+
+def test_a_file_system_without_locks_and_syncs_of_directories_is_recorded_to(tmp_path, monkeypatch):
     fsync = os.fsync
 
     def refuse_directories(descriptor):
@@ -373,19 +349,12 @@ def test_a_directory_that_cannot_be_synchronized_does_not_matter(tmp_path, monke
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
         fsync(descriptor)
 
+    def refuse(descriptor, operation):
+        raise OSError(code, os.strerror(code))
+
     monkeypatch.setattr(os, 'fsync', refuse_directories)
-    recording = recorded(tmp_path / 'run', *messages(3))
-    assert recording.finish().messages == 3
-    assert os.listdir(tmp_path) == ['run']
-
-
-def test_a_file_system_without_locks_is_recorded_to(tmp_path, monkeypatch):
+    monkeypatch.setattr(locks.fcntl, 'flock', refuse)
     for code in (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP):
-
-        def refuse(descriptor, operation, code=code):
-            raise OSError(code, os.strerror(code))
-
-        monkeypatch.setattr(locks.fcntl, 'flock', refuse)
         bag = tmp_path / str(code)
         recording = recorded(bag, *messages(3))
         assert not journal.is_being_written(journal_of(bag))

@@ -10,16 +10,17 @@ import pytest
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Goals
 from rclpy.serialization import serialize_message
-from rosbags.rosbag2 import StoragePlugin, Writer
 from rosgraph_msgs.msg import Clock
 from support.bags import REAL as FOREIGN
-from support.bags import count_more
+from support.bags import SECOND, count_more
 from support.commands import interrupted, refused, run
 from support.lockstep_nodes import make_complete
+from support.raw_bags import channel
 from support.recorded import recorded
 from support.ros_messages import goal, goals, twists
 
-from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.bags.bag_writer import build_bag
+from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.recording.replaying import Playback, Replayer, ReplayProgress, replay
@@ -220,23 +221,24 @@ def test_subscriptions_that_do_not_acknowledge_are_reported(bag, play, impatient
 # --- Nothing to play
 
 
+TYPES = {'/cmd_vel': 'geometry_msgs/msg/Twist', '/goals': 'nav_msgs/msg/Goals'}
+
+
 def build(path, topics, step=1):
     """Write a bag with the messages of each topic at 1 s, and each a step (s) after the one before."""
-    types = {'/cmd_vel': 'geometry_msgs/msg/Twist', '/goals': 'nav_msgs/msg/Goals'}
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        for topic, sent in topics.items():
-            known = definition(types[topic])
-            connection = writer.add_connection(
-                topic, known.name, msgdef=known.text, rihs01=known.type_hash
-            )
-            for index, message in enumerate(sent):
-                writer.write(connection, (1 + index * step) * 1_000_000_000, serialize_message(message))
+    channels = [channel(number, *one) for number, one in enumerate(TYPES.items())]
+    records = [
+        Message(one.id, (1 + index * step) * SECOND, serialize_message(message))
+        for one in channels
+        for index, message in enumerate(topics.get(one.topic, ()))
+    ]
+    build_bag(channels, records, path)
 
 
 def test_nothing_to_play_is_an_error(bag, tmp_path, monkeypatch, play):
     monkeypatch.chdir(tmp_path)
-    build(tmp_path / 'EMPTY', {'/cmd_vel': [], '/goals': []})
-    build(tmp_path / 'SPARSE', {'/cmd_vel': [], '/goals': [Goals()]})
+    build(tmp_path / 'EMPTY', {})
+    build(tmp_path / 'SPARSE', {'/goals': [Goals()]})
     for arguments, words in (
         ((bag, '--goals', '--start-offset', '0.7'), 'no messages of /goals after --start-offset 0.7'),
         (('SPARSE', '--loop'), 'no messages of cmd_vel, only of /goals (--all-topics plays them)'),
@@ -246,17 +248,6 @@ def test_nothing_to_play_is_an_error(bag, tmp_path, monkeypatch, play):
         code, out, err = play(*arguments)
         assert (code, out, err.count('\n')) == (1, '', 1)
         assert err.startswith('replay_run: error: nothing to play: ')
-        assert words in err
-
-
-def test_times_that_are_far_apart_are_reported(tmp_path, play):
-    build(tmp_path / 'FAR', {'/cmd_vel': [Twist(), Twist()]}, step=9_223_372_035)
-    for arguments, words in (
-        (('-r', '0.1'), '--rate must be at least 2'),
-        (('--clock', '-r', '1e9'), 'must have less than 2147483648 s, the bag ends at 9223372036'),
-    ):
-        code, out, err = play(tmp_path / 'FAR', *arguments)
-        assert (code, out, err.count('\n')) == (2, '', 1)
         assert words in err
 
 
@@ -278,30 +269,32 @@ def test_a_run_is_verified_with_parameters_from_a_file(bag, tmp_path):
 
 
 WRONG = [
-    (['BAG', '--start-offset', '99'], '--start-offset must be less than the length of the bag'),
-    (['BAG', '--start-offset', '-1'], 'must be zero or positive and finite, got -1.0'),
-    (['BAG', '-r', '1e-12'], '--rate must be at least '),
-    (['BAG', '--clock', '1e-12'], '--clock must be in [1e-09, 10000] Hz, got 1e-12'),
-    (['BAG', '--clock', '1e12'], '--clock must be in [1e-09, 10000] Hz, got 1e+12'),
-    (['BAG', '-m', '/cmd_vel:=~/x{y}'], "cannot be played as '~/x{y}': failed to resolve name"),
-    (['BAG', '-m', '/cmd_vel:=a b'], "cannot be played as 'a b': failed to resolve name"),
-    (['BAG', '--topics', '/nothing'], 'has no topic /nothing; it has /cmd_vel'),
-    (['BAG', '-m', 'nonsense'], 'must be OLD:=NEW'),
-    (['BAG', '-m', 'cmd_vell:=/sim/cmd_vel'], 'that is played, /cmd_vel, got /cmd_vell'),
-    (['BAG', '--goals', '-m', 'cmd_vel:=/sim/cmd_vel'], 'that is played, /goals, got /cmd_vel'),
-    (['BAG', '-m', 'cmd_vel:=/a', '/cmd_vel:=/b'], '/cmd_vel must be remapped once, got /a and /b'),
-    (['BAG', '-m', '~/x{y}:=/cmd_vel'], 'remapping ~/x{y}:=/cmd_vel: '),
-    (['BAG', '--verify', '--params-file', 'file.txt'], 'file of ROS parameters, got file.txt'),
-    (['BAG', '--goals', '--verify'], 'not allowed with --verify: --goals'),
-    (['--verify', 'BAG', '-r', '2'], 'not allowed with --verify: -r 2'),
-    (['--verify', 'BAG', '--ros-args', '-p', 'x:=1'], 'not allowed with --verify: --ros-args'),
-    (['BAG', '--tolerance', '1'], 'unrecognized arguments: --tolerance 1'),
+    ('BAG --start-offset 99', '--start-offset must be less than the length of the bag'),
+    ('BAG --start-offset -1', 'must be zero or positive and finite, got -1.0'),
+    ('BAG -r 1e-12', '--rate must be at least '),
+    ('BAG --clock 1e-12', '--clock must be in [1e-09, 10000] Hz, got 1e-12'),
+    ('BAG --clock 1e12', '--clock must be in [1e-09, 10000] Hz, got 1e+12'),
+    ('FAR -r 0.1', '--rate must be at least 2'),
+    ('FAR --clock -r 1e9', 'must have less than 2147483648 s, the bag ends at 9223372036'),
+    ('BAG -m /cmd_vel:=~/x{y}', "cannot be played as '~/x{y}': failed to resolve name"),
+    ('BAG --topics /nothing', 'has no topic /nothing; it has /cmd_vel'),
+    ('BAG -m nonsense', 'must be OLD:=NEW'),
+    ('BAG -m cmd_vell:=/sim/cmd_vel', 'that is played, /cmd_vel, got /cmd_vell'),
+    ('BAG --goals -m cmd_vel:=/sim/cmd_vel', 'that is played, /goals, got /cmd_vel'),
+    ('BAG -m cmd_vel:=/a /cmd_vel:=/b', '/cmd_vel must be remapped once, got /a and /b'),
+    ('BAG -m ~/x{y}:=/cmd_vel', 'remapping ~/x{y}:=/cmd_vel: '),
+    ('BAG --verify --params-file file.txt', 'file of ROS parameters, got file.txt'),
+    ('BAG --goals --verify', 'not allowed with --verify: --goals'),
+    ('--verify BAG -r 2', 'not allowed with --verify: -r 2'),
+    ('--verify BAG --ros-args -p x:=1', 'not allowed with --verify: --ros-args'),
+    ('BAG --tolerance 1', 'unrecognized arguments: --tolerance 1'),
 ]
 
 
 def test_wrong_arguments_are_reported(bag, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'file.txt').write_text('not a bag')
+    build(tmp_path / 'FAR', {'/cmd_vel': [Twist(), Twist()]}, step=9_223_372_035)
     for arguments, words in WRONG:
-        given = [bag if one == 'BAG' else one for one in arguments]
+        given = [bag if one == 'BAG' else one for one in arguments.split()]
         assert words in refused('replay_run', *given)
