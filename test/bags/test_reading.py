@@ -10,7 +10,7 @@ import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from support.bags import REAL, SECOND, changed, odom, start, status, write_bag
+from support.bags import SECOND, changed, odom, start, status, write_bag
 from support.raw_bags import channel
 from support.ros_messages import (
     goal,
@@ -142,16 +142,6 @@ def test_a_run_and_a_series_are_printed_in_short(tmp_path):
         '  parameters of /go_to_goal',
         ')',
     ]
-
-
-def test_a_bag_of_another_robot_is_read():
-    run = read_run(REAL)
-    assert len(run.odometry) > 1000
-    assert (np.diff(run.odometry.stamps) > 0).all()
-    assert run.odometry.values[:, 3].max() == pytest.approx(0.15)
-    assert {tuple(row) for row in run.cmd_vel.values.tolist()} <= {
-        *((0.15, 0.0), (0.15, 0.8), (-0.1, -0.6), (0.0, 1.2), (0.0, 0.0))
-    }
 
 
 # --- Names and parameters

@@ -43,7 +43,7 @@ def test_the_kernel_counts_what_it_drops(receiver):
     assert watched.last < overflow.time.time_ns()
 
 
-def test_where_nobody_counts_a_burst_is_an_overflow(receiver):
+def test_a_burst_that_nobody_counts_is_an_overflow(receiver):
     watched = Overflow(counted=False)
     flood(receiver)
     watched.look()

@@ -54,14 +54,14 @@ def recorded(world, tmp_path):
     return record
 
 
-def test_the_last_message_is_read_before_the_end_of_its_publisher_is_heard(recorded):
+def test_the_last_message_is_read_before_the_end_is_heard(recorded):
     """Through a port of its own, discovery was faster in one of six."""
     count, code, output = recorded(10, 5, 300, 10)
     assert (count, code) == (50, 0), output
     assert 'waiting' not in output
 
 
-def test_one_that_overflows_the_buffer_is_not_called_complete(recorded):
+def test_an_overflow_is_not_called_complete(recorded):
     """As much as three buffers hold at once: the rest would be sent again, by a publisher that lives."""
     count, code, output = recorded(1, 10, 60_000, 0)
     assert count == 10 or (code == 1 and 'possibly the end of /said' in output), output

@@ -19,18 +19,22 @@ INTEGERS = {name: value.integer_value for name, value in VALUES.items()}
 UNSET = ('unset', 'other', 'third')
 NAMES = (*list(VALUES)[:7], *UNSET, *list(VALUES)[7:])
 RECORDABLE = {
-    'flag': (True, ParameterValue(type=1, bool_value=True)),
-    'number': (0.5, ParameterValue(type=3, double_value=0.5)),
-    'text': ('a "b"', ParameterValue(type=4, string_value='a "b"')),
-    'bytes': ([[1], [255]], ParameterValue(type=5, byte_array_value=[b'\x01', b'\xff'])),
-    'flags': ([True, False], ParameterValue(type=6, bool_array_value=[True, False])),
-    'integers': ([1, -2], ParameterValue(type=7, integer_array_value=[1, -2])),
-    'numbers': ([0.5, 1.5], ParameterValue(type=8, double_array_value=[0.5, 1.5])),
-    'texts': (['a', 'b'], ParameterValue(type=9, string_array_value=['a', 'b'])),
+    'flag': (1, 'bool_value', True),
+    'number': (3, 'double_value', 0.5),
+    'text': (4, 'string_value', 'a "b"'),
+    'bytes': (5, 'byte_array_value', [b'\x01', b'\xff']),
+    'flags': (6, 'bool_array_value', [True, False]),
+    'integers': (7, 'integer_array_value', [1, -2]),
+    'numbers': (8, 'double_array_value', [0.5, 1.5]),
+    'texts': (9, 'string_array_value', ['a', 'b']),
 }
+"""Number of the type, its field, and a value."""
 UNKNOWN = {f'of_type_{kind}': ParameterValue(type=kind) for kind in (10, 11, 128, 255)}
 UNKNOWN['too_large'] = ParameterValue(type=4, string_value='x' * (parameter_query.MAX_TEXT + 1))
-TYPES = {name: value for name, (_, value) in RECORDABLE.items()} | UNKNOWN
+TYPES = {
+    name: ParameterValue(type=kind, **{field: value})
+    for name, (kind, field, value) in RECORDABLE.items()
+} | UNKNOWN
 
 
 class Stranger(Node):
@@ -98,14 +102,15 @@ def reports(text):
     return dict(found)
 
 
-def test_what_can_be_had_is_recorded_and_the_rest_is_reported(lockstep, tmp_path, capfd):
+def test_what_is_answered_is_recorded_and_the_rest_reported(lockstep, tmp_path, capfd):
     answers = (as_rclcpp, omitting, known, one_more)
     strangers = [Stranger(answer.__name__, NAMES, answer) for answer in answers]
     complete = Stranger('complete', VALUES, known)
     typed = Stranger('typed', TYPES, of_all_types)
     found = recorded_parameters(lockstep, tmp_path, *strangers, complete, typed)
     assert found[:5] == [INTEGERS] * 5
-    assert found[5] == {name: value for name, (value, _) in RECORDABLE.items()}
+    values = {name: value for name, (_, _, value) in RECORDABLE.items()}
+    assert found[5] == {**values, 'bytes': [[1], [255]]}
     said = reports(capfd.readouterr().err)
     assert sorted(said) == sorted([*(one.__name__ for one in answers), 'typed'])
     for stranger in strangers:

@@ -33,9 +33,13 @@ class Sink:
     """Keeps what is recorded."""
 
     def __init__(self):
-        self.data, self.stamps, self.channel = [], [], None
-        self.missed, self.left_out = {}, {}
-        self.set_missed, self.set_left_out = self.missed.__setitem__, self.left_out.__setitem__
+        self.data = []
+        self.stamps = []
+        self.channel = None
+        self.missed = {}
+        self.left_out = {}
+        self.set_missed = self.missed.__setitem__
+        self.set_left_out = self.left_out.__setitem__
 
     def add(self, record):
         if isinstance(record, Message):
@@ -135,7 +139,7 @@ def test_each_message_is_new_once_and_all_gaps_add_up(monkeypatch, runs):
         assert counter.count == sum(max(one) - min(one) + 1 - len(one) for one in seen if one)
 
 
-def test_a_message_that_comes_after_the_end_shows_what_was_missed_before():
+def test_a_late_message_shows_what_was_missed_before():
     counter = MissedMessages()
     counter.received(message(5))
     for number, publisher in ((9, 0), (20, 0), (7, 1), (9, 1)):
@@ -171,7 +175,7 @@ def test_what_was_overwritten_while_it_waited_is_counted(ros, reliability, silen
     assert setting.sink.missed == {'/cmd_vel': 205}
 
 
-def test_the_only_message_of_a_publisher_may_have_been_overwritten(ros):
+def test_the_only_message_of_a_publisher_may_be_lost(ros):
     setting = Setting(ros, {}, {})
     setting.send(1, publisher=1)
     setting.send(DEPTH)
@@ -262,7 +266,7 @@ def test_after_an_overflow_late_messages_are_waited_for(doubt, monkeypatch):
     assert doubt.sink.left_out == DOUBTED
 
 
-def test_a_best_effort_publisher_is_waited_for_only_if_the_recorder_was_held(ros, monkeypatch):
+def test_best_effort_is_waited_for_only_if_the_recorder_was_held(ros, monkeypatch):
     doubt = Doubt(ros, monkeypatch, BEST_EFFORT)
     doubt.end()
     assert doubt.recorder.drained()
@@ -282,13 +286,13 @@ def test_a_reliable_publisher_confirms_by_its_next_message(doubt):
     assert (doubt.recorder.awaited, doubt.sink.left_out) == ([], {})
 
 
-def test_a_publisher_that_ended_after_an_overflow_is_doubted_but_not_waited_for(doubt):
+def test_an_ended_publisher_is_doubted_but_not_waited_for(doubt):
     doubt.until_drained_without_publishers()
     assert doubt.recorder.awaited == []
     assert doubt.sink.left_out == DOUBTED
 
 
-def test_a_publisher_that_sends_on_after_an_overflow_is_not_doubted(doubt, monkeypatch):
+def test_a_publisher_that_sends_on_is_not_doubted(doubt, monkeypatch):
     monkeypatch.setattr(overflow, 'BURST_VOLUME', 1e9)
     for publisher in (0, 1):
         doubt.send(1, publisher)
@@ -297,15 +301,13 @@ def test_a_publisher_that_sends_on_after_an_overflow_is_not_doubted(doubt, monke
     assert doubt.sink.left_out == {}
 
 
-def test_an_overflow_long_after_the_last_message_of_a_publisher_is_no_reason_to_doubt_it(
-    doubt, monkeypatch
-):
+def test_an_overflow_long_after_the_last_message_is_no_doubt(doubt, monkeypatch):
     monkeypatch.setattr(recorder, 'ACTIVE', 0.0)
     doubt.until_drained()
     assert doubt.sink.left_out == {}
 
 
-def test_a_wait_that_is_cut_short_or_too_long_makes_the_recording_incomplete(doubt, monkeypatch):
+def test_a_wait_that_is_cut_short_or_too_long_leaves_a_doubt(doubt, monkeypatch):
     doubt.end()
     doubt.recorder.give_up('no time')
     assert doubt.sink.left_out == {'possibly the end of /cmd_vel': 'no time'}
@@ -315,7 +317,7 @@ def test_a_wait_that_is_cut_short_or_too_long_makes_the_recording_incomplete(dou
     assert 'still arriving' in doubt.sink.left_out['possibly the end of /cmd_vel']
 
 
-def test_what_is_dropped_before_the_next_message_of_a_publisher_is_due_was_of_others(doubt):
+def test_a_drop_before_the_next_message_is_due_was_of_others(doubt):
     """As when a process ends that has hundreds of publishers, each of which is taken back."""
     heard = [*doubt.recorder._receptions['/cmd_vel'].heard.values()]
     assert all(one.shortest < SECOND // 10 for one in heard)
@@ -334,7 +336,7 @@ def test_what_is_dropped_before_the_next_message_of_a_publisher_is_due_was_of_ot
         (9 * SECOND, 5 * SECOND, 5 * SECOND),
     ],
 )
-def test_what_was_sent_again_counts_from_when_it_was_received(sent, received, last):
+def test_what_was_sent_again_counts_from_its_receipt(sent, received, last):
     heard = reception.Heard()
     heard.hear(message(1, 0, sent, received))
     assert (heard.last, heard.shortest) == (last, 0)
@@ -367,7 +369,7 @@ class Subscriptions:
             self.queues[reliability]._receive(message(number))
 
 
-def test_a_reliable_subscription_beside_a_best_effort_one_is_recorded_in_order_and_without_loss(
+def test_reliable_and_best_effort_subscriptions_together_lose_nothing(
     monkeypatch,
 ):
     for reliability in (RELIABLE, BEST_EFFORT):
@@ -442,7 +444,7 @@ def test_a_latched_message_is_recorded_once_beside_another_publisher(ros, latche
 # --- What is recorded, and when
 
 
-def test_invalid_topic_names_of_dds_applications_are_reported_once(ros, monkeypatch, capfd):
+def test_invalid_topic_names_are_reported_once(ros, monkeypatch, capfd):
     # No ROS node can publish such a topic.
     names = ['/foo bar', '/foo//bar', '/1', '/\x1b[2J', '/' + 'a' * 300]
     setting = Setting(ros, topics=())
@@ -459,7 +461,7 @@ def test_invalid_topic_names_of_dds_applications_are_reported_once(ros, monkeypa
     assert sorted(setting.sink.left_out) == sorted(names)
 
 
-def test_a_topic_whose_type_is_not_installed_makes_the_recording_incomplete(ros, monkeypatch):
+def test_a_topic_whose_type_is_not_installed_is_left_out(ros, monkeypatch):
     monkeypatch.setattr(recorder, 'message_class', mock.Mock(side_effect=UnknownTypeError('no Twist')))
     publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
     setting = Setting(ros)
@@ -484,7 +486,7 @@ def test_a_middleware_without_events_is_recorded_from(ros, monkeypatch):
 
 
 @pytest.mark.parametrize('simulated', [False, True])
-def test_the_time_of_a_message_is_that_of_its_receipt_or_of_the_simulated_clock(ros, simulated):
+def test_messages_have_the_time_of_receipt_or_of_the_simulated_clock(ros, simulated):
     setting = Setting(ros, {}, parameters={'use_sim_time': simulated}, now=lambda: 5)
     setting.send(1)
     setting.until_recorded(1)

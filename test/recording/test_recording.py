@@ -138,7 +138,7 @@ def test_a_bag_can_have_any_path_also_behind_a_symbolic_link(tmp_path, monkeypat
     assert content(tmp_path / 'real#' / name) == [one.data for one in messages(3)]
 
 
-def test_a_name_that_no_bag_can_have_is_refused_before_recording(tmp_path):
+def test_a_name_that_no_bag_can_have_is_refused(tmp_path):
     with pytest.raises(OSError, match='must be UTF-8'):
         Recording(tmp_path / os.fsdecode(b'run\xff'))
     assert os.listdir(tmp_path) == []
@@ -195,7 +195,7 @@ def busy(path, disk):
     return recording
 
 
-def test_a_slow_disk_loses_no_message_delays_no_caller_and_gets_few_writes(tmp_path, disk):
+def test_a_slow_disk_loses_nothing_and_gets_few_writes(tmp_path, disk):
     """Each write may take a second."""
     recording = busy(tmp_path / 'run', disk)
     # All of these are taken while one write lasts.
@@ -288,7 +288,7 @@ def test_a_journal_that_goes_is_noticed(tmp_path, change):
         assert content(folder / 'elsewhere') == [one.data for one in messages(50)]
 
 
-def test_what_was_missed_or_left_out_is_reported_also_after_a_crash(tmp_path):
+def test_losses_are_reported_also_after_a_crash(tmp_path):
     bag = tmp_path / 'run'
     recording = recorded(bag, *messages(3))
     recording.set_missed('/cmd_vel', 12)
@@ -341,7 +341,7 @@ def test_discarding_keeps_a_file_of_another_process(tmp_path):
     assert journal.read_text() == 'of somebody else'
 
 
-def test_a_file_system_without_locks_and_syncs_of_directories_is_recorded_to(tmp_path, monkeypatch):
+def test_a_file_system_may_lack_locks_and_syncs_of_directories(tmp_path, monkeypatch):
     fsync = os.fsync
 
     def refuse_directories(descriptor):

@@ -105,7 +105,7 @@ def test_goals_are_played_instead(world, bag, play):
 
 
 @pytest.mark.process
-def test_topics_are_played_with_a_clock_in_loops_until_interrupted(world, bag):
+def test_topics_are_played_with_a_clock_in_loops(world, bag):
     """Each round takes as long as the recording: its first message, the goal, comes once in each."""
     harness = world.harness
     received, told = harness.listen(Twist, 'again'), harness.listen(Goals, 'goals')
@@ -162,7 +162,7 @@ def test_it_waits_for_the_required_number_of_subscriptions(world, bag):
     world.harness.until(lambda: len(first) == len(late.received) == len(COMMANDS), 'both have all')
 
 
-def test_nothing_is_played_to_fewer_subscriptions_than_required(bag, play):
+def test_nothing_is_played_to_too_few_subscriptions(bag, play):
     code, out, _ = play(bag, '-w', '2', '--timeout', '0.2')
     assert code == 1
     assert out == 'nothing was played: /cmd_vel has 0 of 2 subscriptions after --timeout 0.2 s\n'
@@ -188,14 +188,11 @@ def test_what_is_unusual_is_reported(world, bag, tmp_path, play, monkeypatch):
     assert 'no node is subscribed to /goals' in err
 
 
-def test_subscriptions_that_do_not_acknowledge_are_reported(bag, play, impatient, monkeypatch):
+def test_missing_acknowledgements_are_reported(bag, play, impatient, monkeypatch):
     monkeypatch.setattr(Replayer, 'unacknowledged', lambda player: ['/cmd_vel'])
     code, _, err = play(bag, *FAST, '--wait-for-all-acked', '1')
     assert code == 1
-    assert err.splitlines()[-1] == (
-        'replay_run: error: not all subscriptions to /cmd_vel have acknowledged all messages '
-        'within 0.001 s'
-    )
+    assert 'not all subscriptions to /cmd_vel have acknowledged' in err.splitlines()[-1]
     signals = Signals()
 
     def unacknowledged(_):
@@ -242,24 +239,21 @@ def test_a_run_is_verified_with_parameters_from_a_file(tmp_path):
 
 
 WRONG = [
-    ('BAG --start-offset 99', '--start-offset must be less than the length of the bag'),
+    ('BAG --start-offset 99', '--start-offset must be less than the length'),
     ('BAG --start-offset -1', 'must be zero or positive and finite, got -1.0'),
     ('BAG -r 1e-12', '--rate must be at least '),
     ('BAG --clock 1e-12', '--clock must be in [1e-09, 10000] Hz, got 1e-12'),
-    ('BAG --clock 1e12', '--clock must be in [1e-09, 10000] Hz, got 1e+12'),
     ('FAR -r 0.1', '--rate must be at least 2'),
-    ('FAR --clock -r 1e9', 'must have less than 2147483648 s, the bag ends at 9223372036'),
+    ('FAR --clock -r 1e9', 'must have less than 2147483648 s'),
     ('BAG -m /cmd_vel:=~/x{y}', "cannot be played as '~/x{y}': failed to resolve name"),
     ('BAG --topics /nothing', 'has no topic /nothing; it has /cmd_vel'),
     ('BAG -m nonsense', 'must be OLD:=NEW'),
-    ('BAG -m cmd_vell:=/sim/cmd_vel', 'that is played, /cmd_vel, got /cmd_vell'),
-    ('BAG --goals -m cmd_vel:=/sim/cmd_vel', 'that is played, /goals, got /cmd_vel'),
+    ('BAG --goals -m cmd_vel:=/x', 'that is played, /goals, got /cmd_vel'),
     ('BAG -m cmd_vel:=/a /cmd_vel:=/b', '/cmd_vel must be remapped once, got /a and /b'),
     ('BAG -m ~/x{y}:=/cmd_vel', 'remapping ~/x{y}:=/cmd_vel: '),
     ('BAG --verify --params-file file.txt', 'file of ROS parameters, got file.txt'),
     ('BAG --goals --verify', 'not allowed with --verify: --goals'),
     ('--verify BAG -r 2', 'not allowed with --verify: -r 2'),
-    ('--verify BAG --ros-args -p x:=1', 'not allowed with --verify: --ros-args'),
     ('BAG --tolerance 1', 'unrecognized arguments: --tolerance 1'),
 ]
 
