@@ -159,7 +159,7 @@ def test_placements_resets_timeouts_and_parameters_are_driven_again(
         command(0.5, 1.0, 0.5)
         command(-0.5, 2.0, 0.1)
         lockstep.publish('initialpose', placement(3.0, 3.0, -2.0, variances=(0.04, 0.04, 0.04)))
-        lockstep.run_for(0.3)
+        command(-0.4, 1.5, 0.3)
         # The next placement notices the timeout, which took effect since the last odometry.
         command(0.3, -1.0, 0.155)
         lockstep.publish('initialpose', placement(3.0, 3.0, -2.0))
@@ -284,12 +284,16 @@ def test_placements_are_followed_by_the_time_of_recording(lockstep, robot_at, re
     verified(kept(run, odometry=slice(4, None), cmd_vel=slice(1, None)), 0.02)
 
 
-def test_parameters_that_a_robot_reports_when_it_starts_are_used(run):
+def test_parameters_that_a_robot_reports_are_used_by_the_time_of_recording(run):
     (name,) = [node for node in run.parameters if node.endswith('virtual_robot')]
     by_time = kept(run, cmd_vel_out=NOTHING)
-    at = int(run.cmd_vel.received[0]) - 1
-    slow = Changes(name, {'linear.x.max_velocity': 0.05}, at)
-    assert verify(replace(by_time, parameter_events=((at, slow),))).distances.max() > 0.05
+    # Of a robot that starts later than the recorder, and of one that drives.
+    for at in (run.cmd_vel.received[0] - 1, run.odometry.received[50]):
+        slow = Changes(name, {'linear.x.max_velocity': 0.05}, int(at))
+        found = verify(replace(by_time, parameter_events=((int(at), slow),)))
+        before = run.odometry.received < at
+        assert (found.distances[before[-len(found.distances) :]] < 0.02).all()
+        assert found.distances.max() > 0.05
 
 
 def test_a_bag_of_ros2_bag_record_is_verified_against_our_robot():
@@ -339,6 +343,20 @@ def test_a_start_that_does_not_fit_the_odometry_is_a_difference(lockstep, robot_
         {'odometry_covariances': np.full_like(run.odometry_covariances, 7.0)},
     ):
         assert not verify(replace(run, **changes)).agrees(EXACT, EXACT), changes
+
+
+def test_after_a_reset_of_the_odometry_alone_the_truth_has_no_known_start(
+    lockstep, robot_at, recording, command
+):
+    robot_at(simulate_slip=True, cmd_vel_timeout=0.1)
+    command(0.3, -0.7, 0.5)
+    lockstep.call(Trigger, 'reset_odometry')
+    lockstep.run_for(0.2)
+    with recording() as made:
+        lockstep.run_for(0.1)
+        command(0.1, 0.9, 0.3)
+    verification = verified(made.run)
+    assert (verification.start, verification.truth) == ('odometry', None)
 
 
 @pytest.mark.parametrize('missed', [1, 10])
