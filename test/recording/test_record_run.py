@@ -200,8 +200,10 @@ def test_a_disk_that_becomes_full_ends_the_recording(world, bag, monkeypatch):
         return write(descriptor, data)
 
     monkeypatch.setattr(os, 'write', write_until_full)
+    begun = time.monotonic()
     code, _, err = run('record_run', 'text', '-o', bag, '--max-duration', PATIENCE)
     assert code == 1
+    assert time.monotonic() - begun < PATIENCE, 'it did not end by itself'
     assert err.startswith('record_run: error: ')
     assert 'No space left on device' in err
     assert '1 message is missing' in err

@@ -171,6 +171,15 @@ def test_the_journal_stays_if_it_was_altered_on_the_disk(tmp_path):
     assert path.exists()
 
 
+def test_the_journal_stays_if_the_bag_has_fewer_messages_than_were_recorded(tmp_path, monkeypatch):
+    read, left_out = Recording._read, messages(20)[7]
+    monkeypatch.setattr(Recording, '_read', lambda self: (one for one in read(self) if one != left_out))
+    recording = recorded(tmp_path / 'run', *messages(20))
+    error = failed(recording, r'20 messages were recorded, but .*run contains 19')
+    assert error.summary.messages == 19
+    assert journal_of(tmp_path / 'run').exists()
+
+
 def test_a_folder_of_the_user_stays(tmp_path):
     (tmp_path / '.run.building').mkdir()
     (tmp_path / '.run.building' / 'thesis').write_text('precious')
