@@ -47,7 +47,7 @@ def recorded(world, tmp_path):
         child.until_says('recording to')
         arguments = [str(one) for one in publishers]
         assert forked.run(PUBLISHERS, arguments, timeout=60).returncode == 0
-        child.signal(signal.SIGINT)
+        child.signal(signal.SIGTERM)
         code = child.exit()
         return len(read_bag(tmp_path / 'run')), code, child.stdout + child.stderr
 
