@@ -5,8 +5,8 @@ from __future__ import annotations
 import signal
 
 import pytest
-from fork_server import forked
 from std_msgs.msg import String
+from support.processes import run_python, start_python
 from support.raw_bags import read_bag
 
 pytestmark = pytest.mark.process
@@ -46,7 +46,7 @@ def recorded(world, tmp_path):
         child = world.start('record_run', '/said', '-o', str(tmp_path / 'run'))
         child.until_says('recording to')
         arguments = [str(one) for one in publishers]
-        assert forked.run(PUBLISHERS, arguments, timeout=60).returncode == 0
+        assert run_python(PUBLISHERS, arguments, timeout=60).returncode == 0
         child.signal(signal.SIGTERM)
         code = child.exit()
         return len(read_bag(tmp_path / 'run')), code, child.stdout + child.stderr
@@ -88,7 +88,7 @@ with ros_context(['ends']) as context, running(context, isolated=False) as runne
 def test_a_node_of_ours_ends_when_its_last_messages_have_arrived(world):
     received = []
     world.harness.peer.create_subscription(String, 'said', received.append, 100)
-    process = forked.Popen(NODE)
+    process = start_python(NODE)
     world.harness.until(lambda: process.poll() is not None, 'it ends', patience=40.0)
     assert process.wait() == 0
     world.harness.until(lambda: len(received) == 10, 'all has arrived')
