@@ -46,7 +46,7 @@ def recorded(world, tmp_path):
         child = world.start('record_run', '/said', '-o', str(tmp_path / 'run'))
         child.until_says('recording to')
         arguments = [str(one) for one in publishers]
-        assert run_python(PUBLISHERS, arguments, timeout=60).returncode == 0
+        assert run_python(PUBLISHERS, *arguments, timeout=60).returncode == 0
         child.signal(signal.SIGTERM)
         code = child.exit()
         return len(read_bag(tmp_path / 'run')), code, child.stdout + child.stderr
