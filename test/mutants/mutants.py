@@ -56,7 +56,7 @@ PACKAGES = (
     *('tools', 'live', 'plots', 'relations', 'diagnosis'),
 )
 LEFT_OUT = {
-    *('test_documents', 'test_explored_nodes', 'test_fastdds_profiles', 'test_flood', 'test_forked'),
+    *('test_documents', 'test_explored_nodes', 'test_fastdds_profiles'),
     *('test_live_browser', 'test_mutants', 'test_pages', 'test_process_faults', 'test_processes'),
     *('test_real_time', 'test_recover_crash', 'test_signals', 'test_startup'),
 }
