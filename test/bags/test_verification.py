@@ -322,6 +322,7 @@ def test_the_start_counts_if_the_robot_stood_until_the_first_odometry(
     assert verification.start == 'start_pose'
     assert verification.covariance_difference <= COVARIANCE_TOLERANCE
     assert (verification.truth is not None) == slip
+    assert not any('ground_truth was not compared' in note for note in verification.notes)
     assert verified(kept(run, odometry=slice(20, None))).start == 'odometry'
 
 
@@ -357,6 +358,7 @@ def test_after_a_reset_of_the_odometry_alone_the_truth_has_no_known_start(
         command(0.1, 0.9, 0.3)
     verification = verified(made.run)
     assert (verification.start, verification.truth) == ('odometry', None)
+    assert any('ground_truth was not compared' in note for note in verification.notes)
 
 
 @pytest.mark.parametrize('missed', [1, 10])

@@ -274,6 +274,8 @@ def test_best_effort_is_waited_for_only_if_the_recorder_was_held(ros, monkeypatc
     doubt.recorder._called -= 2 * recorder.HELD
     assert not doubt.recorder.drained()
     assert doubt.sink.left_out == {}
+    doubt.recorder.give_up('no time')
+    assert doubt.sink.left_out == {'possibly the end of /cmd_vel': 'no time'}
 
 
 def test_a_reliable_publisher_confirms_by_its_next_message(doubt):
