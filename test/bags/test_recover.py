@@ -316,6 +316,7 @@ def test_what_holds_nothing_of_a_bag_and_places_that_cannot_be_written(run, tmp_
         (['others'], 'holds no files of a bag but journals (*.journal.mcap)'),
         (['other'], 'holds neither .mcap nor .db3 files'),
         (['run', '-o', tmp_path / 'other' / 'notes.txt' / 'new'], 'no bag was written'),
+        (['run', '-o', tmp_path / 'other'], 'other exists already'),
     ):
         code, out, err = recover(capsys, tmp_path / arguments[0], *arguments[1:])
         assert (code, out) == (2, '')
