@@ -90,38 +90,6 @@ class Late(Echo):
             self.out = self.create_publisher(Header, f'{self.get_name()}/late', 10)
 
 
-class Stage(Node):
-    """One of three that talk to one another: a answers the input, b has a timer, c combines both."""
-
-    def __init__(self, name):
-        super().__init__(name)
-        self.state = 0.0
-        topics = {'a': 'intent', 'b': 'bias', 'c': 'combined'}
-        self.out = self.create_publisher(Float64, topics[name], 10)
-        if name == 'c':
-            self.create_subscription(Float64, 'bias', self.on_bias, 10)
-            self.create_subscription(Float64, 'intent', self.on_intent, 10)
-        elif name == 'b':
-            self.create_subscription(Float64, 'input', self.tick, 10)
-            self.create_timer(0.02, self.tick)
-        else:
-            self.create_subscription(Float64, 'input', self.on_input, 10)
-
-    def on_input(self, message):
-        self.out.publish(Float64(data=1.0 - message.data))
-
-    def tick(self, _=None):
-        self.state += 1.0
-        self.out.publish(Float64(data=self.state % 7.0))
-
-    def on_bias(self, message):
-        self.state = 0.7 * self.state + 0.3 * message.data
-
-    def on_intent(self, message):
-        self.out.publish(Float64(data=message.data * (1.0 + 0.2 * self.state)))
-        self.state *= 0.9
-
-
 class Hearing(Echo):
     """Hears what it publishes itself, as a node that looks after the commands of others does."""
 
@@ -253,7 +221,7 @@ class Waiting(Echo):
 
 
 class Creating(Echo):
-    """Creates at a number what cannot take part, and destroys some of it at 0."""
+    """Creates at a number what cannot take part, and destroys that, unless it is a node, at 0."""
 
     def on_number(self, number):
         super().on_number(number)
@@ -265,21 +233,9 @@ class Creating(Echo):
         elif which == 2.0:
             self.created = self.create_publisher(String, f'{name}/text', 10)
         elif which == 3.0:
-            self.created = Node(name, start_parameter_services=False)
-        elif which == 4.0:
-            self.created = Node('spy')
-            self.created.create_subscription(Float64, f'{name}/in', lambda message: None, 10)
+            self.created = self.create_publisher(Header, f'{name}/out', qos_profile_sensor_data)
         else:
-            self.destroy_publisher(self.out)
-            self.out = self.create_publisher(Header, f'{name}/out', qos_profile_sensor_data)
-
-
-class WallTimer(Echo):
-    """Publishes in a timer on wall time, once it has received anything."""
-
-    def on_number(self, number):
-        clock = rclpy.clock.Clock(clock_type=rclpy.clock.ClockType.STEADY_TIME)
-        self.create_timer(0.03, lambda: self.send(-1.0), clock=clock)
+            self.created = Node(name, start_parameter_services=False)
 
 
 class Threaded(Echo):
@@ -332,9 +288,9 @@ CLASSES = [one for one in list(globals().values()) if isinstance(one, type) and 
 NODES = {
     **{one.__name__.lower(): one for one in CLASSES},
     'bare': lambda name: Echo(name, start_parameter_services=False),
+    'kept': Echo,
     'untimed': lambda name: Echo(name, parameter_overrides=[Parameter('use_sim_time', value=False)]),
     'best_effort': lambda name: Repeater(name, qos_profile_sensor_data),
-    **dict.fromkeys(('a', 'b', 'c'), Stage),
     'other': Shared,
 }
 
