@@ -201,7 +201,7 @@ def test_an_event_loop_is_warned_of(lockstep):
 def test_several_nodes_in_cpp_are_warned_of(lockstep, monkeypatch):
     # As if it were in C++: a library that the process has.
     monkeypatch.setattr(idle, 'RCLCPP', '_rclpy_pybind11')
-    with pytest.warns(UserWarning) as warned:
+    with pytest.warns(UserWarning, match='executor|rclcpp') as warned:
         lockstep.start(command('ticker', 'bare'))
     assert {one.filename for one in warned} == {__file__}
     text = '\n'.join(str(one.message) for one in warned)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import suppress
-from functools import lru_cache, wraps
+from functools import lru_cache
 
 import pytest
 import rclpy.wait_for_message
@@ -13,7 +13,6 @@ from geometry_msgs.msg import Vector3
 from nav_msgs.msg import Odometry
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode
 from rclpy.logging import get_logger
 from rclpy.node import Node
@@ -21,7 +20,7 @@ from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from rclpy.wait_for_message import wait_for_message
-from std_msgs.msg import Float64, Header
+from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import make
 from support.ros_messages import goal
@@ -41,6 +40,10 @@ def impatient():
         yield world
 
 
+def fails(words):
+    return pytest.raises(LockstepError, match=words)
+
+
 def never():
     return False
 
@@ -50,7 +53,7 @@ def forever():
         pass
 
 
-# --- Conditions and callbacks
+# --- Conditions and errors
 
 
 def test_a_condition_that_is_never_true_is_named_with_the_last_messages(lockstep):
@@ -63,7 +66,7 @@ def test_a_condition_that_is_never_true_is_named_with_the_last_messages(lockstep
     assert first == 'not within 3 s of simulated time: pigs fly'
     assert rest[0] == 'last messages, at 4 s of the clock, 3 s after the start:'
     assert '  /b: 1 from /parrot, last at 1 s: Vector3(x=0.5)' in rest
-    with pytest.raises(LockstepError, match=r'condition .*never \(.*test_lockstep_failures.py:\d+\)'):
+    with fails(r'condition .*never \(.*test_lockstep_failures.py:\d+\)'):
         lockstep.run_until(never, timeout=0.1)
 
 
@@ -90,34 +93,7 @@ def test_what_a_callback_raises_fails_the_test_with_its_traceback(lockstep):
         assert caught.traceback[-1].name.startswith('on_')
 
 
-class Blocking(Node):
-    def __init__(self, wait):
-        super().__init__('blocking')
-        self.wait = wait
-        self.create_subscription(Vector3, 'a', lambda message: None, 10)
-        self.create_timer(0.1, self.on_tick)
-
-    def on_tick(self):
-        self.wait()
-
-
-@pytest.mark.parametrize('wait', [lambda: time.sleep(1000), threading.Event().wait, forever])
-def test_a_callback_that_blocks_is_named(impatient, wait):
-    impatient.add(Echo('innocent', 'a', 'b'))
-    with pytest.raises(LockstepError) as caught:
-        impatient.add(Blocking(wait))
-    first = str(caught.value).splitlines()[0]
-    assert first.startswith('at 1 s: Blocking.on_tick (timer of 0.1 s, node /blocking, ')
-    assert 'has not returned for 0.5 s of wall time; it is at ' in first
-    assert 'innocent' not in first
-
-
-def decorated(method):
-    @wraps(method)
-    def inner(*arguments):
-        return method(*arguments)
-
-    return inner
+# --- Callbacks that do not return
 
 
 class Called:
@@ -125,23 +101,25 @@ class Called:
         forever()
 
 
-class Decorated(Node):
-    @decorated
-    def on_tick(self):
-        forever()
-
-
-def test_callbacks_that_are_no_plain_functions_are_named(impatient):
-    node = Decorated('decorated')
-    for callback, name in (
-        (node.on_tick, 'Decorated.on_tick'),
+@pytest.mark.parametrize(
+    ('callback', 'name'),
+    [
+        (lambda: time.sleep(1000), '<lambda>'),
+        (threading.Event().wait, 'Event.wait'),
         (Called(), 'Called.__call__'),
         (lru_cache(forever), 'forever'),
-    ):
-        timer = node.create_timer(0.1, callback)
-        with pytest.raises(LockstepError, match=rf'at \S+ s: {name} \(timer of 0.1 s, node /decorated'):
-            impatient.add(node) if node not in impatient.nodes else impatient.run_for(0.3)
-        node.destroy_timer(timer)
+    ],
+)
+def test_a_callback_that_blocks_is_named(impatient, callback, name):
+    impatient.add(Echo('innocent', 'a', 'b'))
+    impatient.add(Node('blocking')).create_timer(0.1, callback)
+    with pytest.raises(LockstepError) as caught:
+        impatient.run_for(0.3)
+    first = str(caught.value).splitlines()[0]
+    assert first.startswith('at 1.1 s: ')
+    assert f'{name} (timer of 0.1 s, node /blocking' in first
+    assert 'has not returned for 0.5 s of wall time; it is at ' in first
+    assert 'innocent' not in first
 
 
 def test_a_law_that_loops_is_named_with_its_node(impatient):
@@ -149,35 +127,66 @@ def test_a_law_that_loops_is_named_with_its_node(impatient):
     impatient.add(make(VirtualRobot))
     law = Controller(name='loops', summary='never returns', law=lambda *_: forever())
     impatient.add(GoToGoal(controller=law))
-
-    def run():
-        impatient.publish('goal_pose', goal(1.0, 0.0))
+    impatient.publish('goal_pose', goal(1.0, 0.0))
+    with fails(r'GoToGoal._on_odometry \(subscribed to /odom, node /go_to_goal'):
         impatient.run_for(1.0)
 
-    named = r'GoToGoal._on_odometry \(subscribed to /odom, node /go_to_goal'
-    with pytest.raises(LockstepError, match=named):
-        run()
+
+def test_a_jump_callback_that_blocks_is_named(impatient):
+    threshold = JumpThreshold(
+        min_forward=Duration(seconds=1.0), min_backward=None, on_clock_change=False
+    )
+    clock = impatient.add(Node('jumping')).get_clock()
+    handle = clock.create_jump_callback(threshold, pre_callback=forever)
+    with fails(r'forever \(.*test_lockstep_failures.py.*has not returned'):
+        impatient.jump(5.0)
+    handle.unregister()
 
 
-def call(client):
-    client.call(Trigger.Request())
+def test_endless_callbacks_are_named(impatient):
+    impatient.add(Echo('ping', 'a', 'b'))
+    impatient.add(Echo('pong', 'b', 'a'))
+    with fails('callbacks without end: for') as caught:
+        impatient.publish('a', Vector3())
+    first, *rest = str(caught.value).splitlines()
+    assert 'Echo.on_message (subscribed to /a, node /ping' in first
+    assert 'Echo.on_message (subscribed to /b, node /pong' in first
+    assert any('/a: ' in line and 'from /pong' in line for line in rest)
 
 
-def call_for_a_while(client):
-    with suppress(Exception):
-        client.call(Trigger.Request(), timeout_sec=0.2)
+def test_a_world_and_its_tasks_continue_after_a_failure(impatient):
+    gate, passed = Future(), []
+
+    async def stuck():
+        forever()
+
+    async def waiting():
+        passed.append(await gate)
+
+    impatient.node.executor.create_task(stuck)
+    impatient.node.executor.create_task(waiting)
+    with fails('stuck'):
+        impatient.settle()
+    gate.set_result(1)
+    blinker = impatient.add(Blinker())
+    impatient.run_for(1.0)
+    assert passed == [1]
+    assert len(blinker.ticks) >= 100
 
 
-def poll(client):
-    future, end = client.call_async(Trigger.Request()), time.monotonic() + 0.3
-    while not future.done() and time.monotonic() < end:
-        time.sleep(0.01)
+@pytest.mark.parametrize('period', [0.0, 9e-7])
+def test_a_timer_that_would_stop_the_time_is_refused(lockstep, period):
+    lockstep.node.create_timer(period, lambda: None)
+    with fails(rf'/lockstep has a period of {period * 1e9:.0f} ns; .* 1000'):
+        lockstep.run_for(1.0)
 
 
-def poll_result(client):
-    future, end = client.call_async(Trigger.Request()), time.monotonic() + 0.3
-    while future.result() is None and time.monotonic() < end:
-        time.sleep(0.01)
+# --- Callbacks that wait for what cannot come
+
+
+def call_and_catch_everything(client):
+    with suppress(BaseException):
+        client.call(Trigger.Request())
 
 
 def poll_by_a_function(client):
@@ -190,72 +199,64 @@ def poll_by_a_function(client):
         time.sleep(0.01)
 
 
+def poll_result(client):
+    future, end = client.call_async(Trigger.Request()), time.monotonic() + 0.3
+    while future.result() is None and time.monotonic() < end:
+        time.sleep(0.01)
+
+
 def wait_for_an_event(client):
     event = threading.Event()
     client.call_async(Trigger.Request()).add_done_callback(lambda _: event.set())
     event.wait(0.1)
 
 
-def spin(client):
-    executor = SingleThreadedExecutor()
-    executor.spin_until_future_complete(client.call_async(Trigger.Request()), timeout_sec=0.1)
-
-
-def call_and_catch_everything(client):
-    with suppress(BaseException):
-        client.call(Trigger.Request())
-
-
 @pytest.mark.parametrize(
     ('wait', 'how'),
     [
-        (call, r'\(client.call\)'),
-        (call_for_a_while, r'\(client.call\)'),
         (call_and_catch_everything, r'\(client.call\)'),
-        (poll, r'\(future.done\)'),
         (poll_by_a_function, r'\(future.done\)'),
         (poll_result, r'\(future.result\)'),
-        (spin, r'\(future.done\)'),
         (wait_for_an_event, 'until a timeout'),
     ],
 )
 def test_a_callback_that_waits_for_a_response_is_named_also_with_a_timeout(lockstep, wait, how):
-    node = Node('waiting')
+    node = lockstep.add(Node('waiting'))
     client = node.create_client(Trigger, 'other')
     lockstep.node.create_service(Trigger, 'other', lambda _, response: response)
     node.create_timer(0.1, lambda: wait(client))
-
-    def run():
-        lockstep.add(node)
+    with fails(
+        rf'at 1.1 s: node /waiting waits for a response of /other {how}, in ({wait.__name__}|ready) '
+        r'\(.*test_lockstep_failures.py:\d+\): it cannot arrive'
+    ):
         lockstep.run_for(0.3)
 
-    with pytest.raises(
-        LockstepError,
-        match=rf'at 1 s: node /waiting waits for a response of /other {how}, in ({wait.__name__}|ready) '
-        r'\(.*test_lockstep_failures.py:\d+\): it cannot arrive',
-    ):
-        run()
 
-
-def test_a_node_beside_the_world_that_is_spun_in_a_callback_is_named(lockstep):
-    """The usual way to call a service from a callback: it would get no answer, in silence."""
-    helper = Node('helper')
+def test_other_waits_in_callbacks_are_named(lockstep):
+    """Each would end in silence, or never."""
+    node, helper = lockstep.add(Node('waiting')), Node('helper')
     client = helper.create_client(Trigger, 'other')
     lockstep.node.create_service(Trigger, 'other', lambda _, response: response)
 
-    def ask():
+    def spin():
         rclpy.spin_until_future_complete(helper, client.call_async(Trigger.Request()), timeout_sec=0.2)
 
-    lockstep.node.create_timer(0.1, ask)
-    with pytest.raises(LockstepError, match='node /helper waits for a response of /other'):
-        lockstep.run_for(0.3)
-
-
-def test_a_callback_that_sleeps_by_a_rate_is_named(lockstep):
-    node = lockstep.add(Node('sleeping'))
-    node.create_timer(0.1, lambda: node.create_rate(10.0).sleep())
-    with pytest.raises(LockstepError, match='a callback sleeps by a rate, in <lambda>'):
-        lockstep.run_for(0.3)
+    for wait, words in (
+        (spin, 'node /helper waits for a response of /other'),
+        (lambda: node.create_rate(10.0).sleep(), 'a callback sleeps by a rate, in <lambda>'),
+        (
+            lambda: wait_for_message(Float64, node, 'value', time_to_wait=0.2),
+            'wait_for_message waits for a message, in <lambda>',
+        ),
+        (
+            lambda: node.get_clock().sleep_for(Duration(seconds=1.0)),
+            'node /waiting sleeps on its clock within a callback',
+        ),
+    ):
+        timer = node.create_timer(0.1, wait)
+        with fails(words):
+            lockstep.run_for(0.3)
+        node.destroy_timer(timer)
 
 
 def test_a_callback_may_look_whether_a_response_has_come(lockstep):
@@ -288,82 +289,19 @@ def test_each_callback_and_the_test_may_look_on_their_own(lockstep):
         assert not future.done()
         assert future.result() is None
     assert seen == 10 * [False]
-    with pytest.raises(LockstepError, match='of /never_there would never return: time passes'):
+    with fails('of /never_there would never return: time passes'):
         client.call(Trigger.Request())
     waited = threading.Event().wait(0.001)
     assert not waited
 
 
-def test_a_callback_that_waits_for_a_message_is_named(lockstep):
-    node = lockstep.add(Node('waiting'))
-    node.create_timer(0.1, lambda: wait_for_message(Float64, node, 'value', time_to_wait=0.2))
-    with pytest.raises(LockstepError, match='wait_for_message waits for a message, in <lambda>'):
-        lockstep.run_for(0.3)
-
-
-def test_wait_for_message_is_as_before_when_the_world_has_ended():
+def test_rclpy_is_as_before_when_the_world_has_ended():
     before = rclpy.wait_for_message.SignalHandlerGuardCondition
     with Lockstep():
         assert rclpy.wait_for_message.SignalHandlerGuardCondition is not before
+        assert Publisher.publish.__module__ != 'rclpy.publisher'
     assert rclpy.wait_for_message.SignalHandlerGuardCondition is before
-
-
-def test_a_jump_callback_that_blocks_is_named(impatient):
-    threshold = JumpThreshold(
-        min_forward=Duration(seconds=1.0), min_backward=None, on_clock_change=False
-    )
-    clock = impatient.add(Node('jumping')).get_clock()
-    handle = clock.create_jump_callback(threshold, pre_callback=forever)
-    with pytest.raises(LockstepError, match=r'forever \(.*test_lockstep_failures.py.*has not returned'):
-        impatient.jump(5.0)
-    handle.unregister()
-
-
-def test_endless_callbacks_are_named(impatient):
-    impatient.add(Echo('ping', 'a', 'b'))
-    impatient.add(Echo('pong', 'b', 'a'))
-    with pytest.raises(LockstepError, match='callbacks without end: for') as caught:
-        impatient.publish('a', Vector3())
-    first, *rest = str(caught.value).splitlines()
-    assert 'Echo.on_message (subscribed to /a, node /ping' in first
-    assert 'Echo.on_message (subscribed to /b, node /pong' in first
-    assert any('/a: ' in line and 'from /pong' in line for line in rest)
-
-
-@pytest.mark.parametrize('period', [0.0, 1e-9, 9e-7])
-def test_a_timer_that_would_stop_the_time_is_refused(lockstep, period):
-    lockstep.node.create_timer(period, lambda: None)
-    with pytest.raises(
-        LockstepError, match=rf'/lockstep has a period of {period * 1e9:.0f} ns; .* 1000'
-    ):
-        lockstep.run_for(1.0)
-
-
-def test_a_callback_that_sleeps_on_its_clock_is_named(lockstep):
-    node = lockstep.add(Node('sleeper'))
-    node.create_timer(0.1, lambda: node.get_clock().sleep_for(Duration(seconds=1.0)))
-    with pytest.raises(LockstepError, match='node /sleeper sleeps on its clock within a callback'):
-        lockstep.run_for(0.3)
-
-
-def test_a_world_and_its_tasks_continue_after_a_failure(impatient):
-    gate, passed = Future(), []
-
-    async def stuck():
-        forever()
-
-    async def waiting():
-        passed.append(await gate)
-
-    impatient.node.executor.create_task(stuck)
-    impatient.node.executor.create_task(waiting)
-    with pytest.raises(LockstepError, match='stuck'):
-        impatient.settle()
-    gate.set_result(1)
-    blinker = impatient.add(Blinker())
-    impatient.run_for(1.0)
-    assert passed == [1]
-    assert len(blinker.ticks) >= 100
+    assert Publisher.publish.__module__ == 'rclpy.publisher'
 
 
 # --- The report
@@ -390,39 +328,27 @@ def test_the_report_has_what_was_published_before_a_node_was_added_but_not_what_
     inactive = lockstep.add(LifecycleNode('sleepy')).create_lifecycle_publisher(Vector3, 'a', 10)
     inactive.publish(Vector3())
     publisher = lockstep.node.create_publisher(Vector3, 'b', 10)
-    with pytest.raises(TypeError):
-        publisher.publish('b')
-    lockstep.settle()
-    assert '/a' not in lockstep.report()
-    assert '/b: 1' not in lockstep.report()
     publisher.publish(Vector3(x=2.0))
     with pytest.raises(TypeError):
         publisher.publish('b')
-    assert lockstep.last('b') == Vector3(x=2.0)
-    assert '/b: 1 from' in lockstep.report()
+    assert '/a' not in lockstep.report()
+    assert '/b: 1 from /lockstep, last at 1 s: Vector3(x=2)' in lockstep.report()
 
 
-def test_the_report_has_what_was_received(lockstep):
-    """Also of bytes, and of what would be refused."""
-    heard = lockstep.listen(Vector3, 'a')
+def test_the_report_has_bytes_and_values_that_messages_do_not_allow(lockstep):
     publisher = lockstep.node.create_publisher(Vector3, 'a', 10)
+    heard = lockstep.listen(Vector3, 'a')
     message = Vector3()
     # As `message.x = 1` without the checks of rclpy, which are on in these tests.
     message._x = 1
     publisher.publish(message)
     lockstep.settle()
-    # Which one depends on the version of Python.
-    assert 0.0 < heard[0].x < 1e-300
-    assert lockstep.last('a').x == heard[0].x
+    # What was received depends on the version of Python.
     assert f'Vector3(x={heard[0].x})' in lockstep.report()
     publisher.publish(serialize_message(Vector3(x=0.5)))
     assert 'last at 1 s: Vector3(x=0.5)' in lockstep.report()
     publisher.publish(b'\0\1')
     assert 'last at 1 s: 2 serialized bytes' in lockstep.report()
-    publisher, message = lockstep.node.create_publisher(Header, 'b', 10), Header(frame_id='odom')
-    publisher.publish(message)
-    message._stamp = None
-    assert "frame_id='odom'" in lockstep.report()
 
 
 def test_last_is_the_last_message_of_all_publishers(lockstep):
@@ -432,10 +358,5 @@ def test_last_is_the_last_message_of_all_publishers(lockstep):
         assert lockstep.last('a').x == x
     two.publish(serialize_message(Vector3(x=4.0)))
     assert lockstep.last('/a') == Vector3(x=4.0)
-    with pytest.raises(LockstepError, match='no message was published on /b\n'):
+    with fails('no message was published on /b\n'):
         lockstep.last('b')
-
-
-def test_publishing_is_counted_only_while_a_world_is_open(lockstep):
-    lockstep.close()
-    assert Publisher.publish.__module__ == 'rclpy.publisher'
