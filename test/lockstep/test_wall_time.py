@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -20,54 +19,41 @@ from diffdrive_jacobian.testing import Lockstep, LockstepError
 pytestmark = pytest.mark.process
 NODES = Path(__file__).with_name('wall_time_nodes.py')
 PERIODS = {
-    **dict.fromkeys(('steady', 'system', 'sleep', 'event', 'condition', 'select', 'poll'), 20.0),
-    **dict.fromkeys(('posted', 'late', 'waiting'), 20.0),
+    **dict.fromkeys(('steady', 'system', 'sleep', 'event', 'select', 'poll', 'posted'), 20.0),
     # Python computes again for how long is left, and asyncio waits a millisecond longer.
     'queue': 20.001,
     'children': 21.0,
     'asyncio': 21.0,
 }
-"""When each kind of node publishes (ms)."""
+"""When each kind of timer or thread publishes (ms)."""
 compiled = pytest.mark.skipif(
     not any(map(shutil.which, wall_time.COMPILERS)),
     reason='simulated wall time needs a C compiler',
 )
 
 
-class Heard(Node):
-    """Hears what a node says, and when (ms), and offers a service."""
-
-    def __init__(self, world):
-        super().__init__('listener')
-        self.all = []
+def run(*kinds, **options):
+    """Run a node. Return what each kind said and when (ms), and the digest of all messages."""
+    heard = {kind: [] for kind in kinds}
+    with Lockstep() as world, MessageDigest(world) as digest:
+        world.node.create_service(Trigger, 'offered', lambda _, response: response)
 
         def hear(message):
-            self.all.append((round(1000.0 * world.elapsed, 6), message.data))
+            kind, said = message.data.split(maxsplit=1)
+            heard[kind].append((round(1000.0 * world.elapsed, 6), said))
 
-        self.create_subscription(String, 'tick', hear, 10)
-        self.create_service(Trigger, 'offered', lambda _, response: response)
-
-
-def run(kind, seconds=0.3, **options):
-    """Run a node. Return what it said and when, and the digest of all messages."""
-    with Lockstep() as world, MessageDigest(world) as digest:
-        world.add(heard := Heard(world))
-        process = world.start([sys.executable, str(NODES), kind], wall_time='simulated', **options)
-        world.run_for(seconds)
+        world.node.create_subscription(String, 'tick', hear, 100)
+        process = world.start([sys.executable, str(NODES), *kinds], wall_time='simulated', **options)
+        if len(kinds) > 1:
+            world.publish('poke', String())
+        world.run_for(0.3)
         value = digest.value()
         assert process.stop() == 0
-        return heard.all, value
+        return heard, value
 
 
-@compiled
-@pytest.mark.parametrize(('kind', 'period'), PERIODS.items(), ids=PERIODS)
-def test_what_waits_on_wall_time_goes_on_in_simulated_time(kind, period):
-    """To the millisecond, as its own clock sees it, too, and the same in each run."""
-    (heard, digest), (again, digest_again) = run(kind), run(kind)
-    if kind != 'waiting':
-        # How often that looked for a service before is not determined.
-        assert heard == again
-        assert digest == digest_again
+def check_period(heard, period):
+    """Check the times of messages, to the millisecond, and what the node's own clock said."""
     times, said = zip(*heard, strict=True)
     assert times == pytest.approx([period * number for number in range(1, 1 + int(300.0 / period))])
     spans = np.diff([float(text) for text in said])
@@ -75,23 +61,44 @@ def test_what_waits_on_wall_time_goes_on_in_simulated_time(kind, period):
 
 
 @compiled
+def test_what_waits_on_wall_time_goes_on_in_simulated_time():
+    """The same in each run."""
+    (heard, digest), again = run(*PERIODS), run(*PERIODS)
+    for kind, period in PERIODS.items():
+        check_period(heard[kind], period)
+    assert (heard, digest) == again
+
+
+@compiled
+@pytest.mark.parametrize('kind', ['late', 'waiting'])
+def test_who_waits_at_the_start_goes_on_in_simulated_time(kind):
+    heard, _ = run(kind)
+    check_period(heard[kind], 20.0)
+
+
+@compiled
 def test_a_loop_that_spins_once_at_a_time_repeats():
     """Each message, also the time every 10 ms, ends a wait of it."""
     (heard, digest), again = run('once'), run('once')
     assert (heard, digest) == again
-    assert {10.0, 20.0, 300.0} <= {time for time, _ in heard}
+    assert {10.0, 20.0, 300.0} <= {time for time, _ in heard['once']}
 
 
 @compiled
 def test_who_is_due_at_once_goes_on_in_the_order_of_its_threads():
-    heard, _ = run('two')
-    assert heard == [(20.0 * number, 'timer thread') for number in range(1, 16)]
+    """Also without use_sim_time. Nothing is left open."""
+    before = len(os.listdir('/proc/self/fd'))
+    heard, _ = run('two', use_sim_time=False)
+    assert heard['two'] == [(20.0 * number, 'timer thread') for number in range(1, 16)]
+    assert len(os.listdir('/proc/self/fd')) <= before
 
 
 @compiled
-def test_a_node_without_use_sim_time_follows_simulated_time_too():
-    heard, _ = run('system', use_sim_time=False)
-    assert [time for time, _ in heard] == [20.0 * number for number in range(1, 16)]
+def test_a_loop_that_waits_until_it_is_later_gets_later():
+    """By microseconds, after some looks."""
+    heard, _ = run('pipe')
+    times = [time for time, _ in heard['pipe']]
+    assert times == pytest.approx([20.0 * number for number in range(1, 15)], abs=0.5)
 
 
 @compiled
@@ -100,14 +107,6 @@ def test_what_cannot_follow_is_named():
         LockstepError, match=r"alarm .* calls setitimer, which wall_time='simulated' does not"
     ):
         run('alarm')
-
-
-@compiled
-def test_nothing_is_left_open():
-    run('sleep')
-    before = len(os.listdir('/proc/self/fd'))
-    run('sleep')
-    assert len(os.listdir('/proc/self/fd')) <= before
 
 
 @pytest.mark.parametrize('how', ['real', pytest.param('simulated', marks=compiled)])
@@ -134,15 +133,6 @@ def test_a_thread_in_cpp_that_waits_on_wall_time_is_warned_of(monkeypatch):
 
 
 @compiled
-def test_a_loop_that_waits_until_it_is_later_gets_later():
-    """By microseconds, after some looks."""
-    (heard, digest), again = run('pipe'), run('pipe')
-    assert (heard, digest) == again
-    times = [time for time, _ in heard]
-    assert times == pytest.approx([20.0 * number for number in range(1, 15)], abs=0.5)
-
-
-@compiled
 def test_slots_of_threads_that_were_killed_are_free_again(monkeypatch):
     monkeypatch.setattr(wall_time, 'MANY', 2)
     there = wall_time.WallTime(1)
@@ -156,6 +146,11 @@ def test_slots_of_threads_that_were_killed_are_free_again(monkeypatch):
 
 
 def test_a_library_that_cannot_be_built_is_named(monkeypatch, tmp_path):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    with monkeypatch.context() as patched:
+        patched.setenv('PATH', str(tmp_path))
+        with pytest.raises(LockstepError, match='needs a C compiler once, cc, gcc or clang'):
+            wall_time.built()
     compiler = tmp_path / 'cc'
     monkeypatch.setenv('PATH', f'{tmp_path}:{os.environ["PATH"]}')
     for script, words in (
@@ -174,12 +169,3 @@ def test_a_library_that_cannot_be_built_is_named(monkeypatch, tmp_path):
         monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / folder))
         with pytest.raises(LockstepError, match=words):
             wall_time.built()
-
-
-def test_without_a_compiler_the_error_says_what_it_would_allow(monkeypatch, tmp_path):
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
-    monkeypatch.setenv('PATH', str(tmp_path))
-    with pytest.raises(
-        LockstepError, match='needs a C compiler once, cc, gcc or clang, and there is none'
-    ):
-        wall_time.built()

@@ -1,11 +1,11 @@
-"""Nodes that live by wall time, each started as a process: `python wall_time_nodes.py KIND`.
+"""Nodes that live by wall time, each started as a process: `python wall_time_nodes.py KIND ...`.
 
-Every 20 ms they publish on `tick` for how long they have run, as their own clocks say.
+Every 20 ms each kind publishes on `tick` its name and for how long it has run, as its own clock says.
+Several kinds begin together, with a message.
 """
 
 import asyncio
 import multiprocessing
-import os
 import queue
 import select
 import signal
@@ -23,134 +23,145 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 PERIOD = 0.02
+CLOCKS = {
+    **dict.fromkeys(('steady', 'late', 'waiting'), ClockType.STEADY_TIME),
+    'system': ClockType.SYSTEM_TIME,
+}
+"""Kinds that are a timer, with its clock."""
 
 
-def main():
-    kind = sys.argv[1]
-    if kind == 'late':
-        time.sleep(3.0)
-    rclpy.init()
-    node = rclpy.create_node('ticker')
-    publisher = node.create_publisher(String, 'tick', 100)
-    begin = time.monotonic()
-    said = []
+# --- Kinds that are a thread, which waits again and again
 
-    def tick():
-        publisher.publish(String(data=f'{time.monotonic() - begin:.3f}'))
+pipe, other_pipe = multiprocessing.Pipe()
+lock = threading.Lock()
+lock.acquire()
 
-    def forever(wait):
+
+def get_from_queue():
+    with suppress(queue.Empty):
+        queue.Queue().get(timeout=PERIOD)
+
+
+def wait_for_files():
+    poll = select.poll()
+    poll.register(pipe, select.POLLIN)
+    poll.poll(1000.0 * PERIOD)
+
+
+def wait_for_lock():
+    """Another thread releases it before."""
+    lock.acquire(timeout=5.0)
+
+
+def wait_for_child():
+    """Its end interrupts what waits in this process for files."""
+    time.sleep(PERIOD)
+    subprocess.run([sys.executable, '-c', 'import time; time.sleep(0.001)'], check=True)
+
+
+WAITS = {
+    'sleep': lambda: time.sleep(PERIOD),
+    'event': lambda: threading.Event().wait(PERIOD),
+    'queue': get_from_queue,
+    'select': lambda: select.select([pipe], [], [], PERIOD),
+    'poll': wait_for_files,
+    'posted': wait_for_lock,
+    'children': wait_for_child,
+    # It looks again until it is later than it was to wait.
+    'pipe': lambda: other_pipe.poll(PERIOD),
+}
+
+
+def in_a_thread(function):
+    threading.Thread(target=function, daemon=True).start()
+
+
+def post():
+    while rclpy.ok():
+        time.sleep(PERIOD)
+        lock.release()
+
+
+async def tick_in_event_loop(tick):
+    while rclpy.ok():
+        await asyncio.sleep(PERIOD)
+        tick()
+
+
+def start(kind, node, tick):
+    """Start one kind of a node."""
+    if kind in WAITS:
+
         def loop():
             while rclpy.ok():
-                wait()
+                WAITS[kind]()
                 tick()
 
-        threading.Thread(target=loop, daemon=True).start()
-
-    if kind in ('steady', 'system', 'late'):
-        clock = Clock(clock_type=ClockType.SYSTEM_TIME if kind == 'system' else ClockType.STEADY_TIME)
-        node.create_timer(PERIOD, tick, clock=clock)
-    elif kind == 'sleep':
-        forever(lambda: time.sleep(PERIOD))
-    elif kind == 'event':
-        forever(lambda: threading.Event().wait(PERIOD))
-    elif kind == 'condition':
-        condition = threading.Condition()
-
-        def wait():
-            with condition:
-                condition.wait(PERIOD)
-
-        forever(wait)
-    elif kind == 'queue':
-
-        def get():
-            with suppress(queue.Empty):
-                queue.Queue().get(timeout=PERIOD)
-
-        forever(get)
-    elif kind == 'select':
-        reader, _ = os.pipe()
-        forever(lambda: select.select([reader], [], [], PERIOD))
-    elif kind == 'poll':
-        reader, _ = os.pipe()
-        poll = select.poll()
-        poll.register(reader)
-        forever(lambda: poll.poll(1000.0 * PERIOD))
-    elif kind == 'pipe':
-        # It looks again until it is later than it was to wait.
-        one, _ = multiprocessing.Pipe()
-        forever(lambda: one.poll(PERIOD))
-    elif kind == 'asyncio':
-
-        async def ticking():
-            while rclpy.ok():
-                await asyncio.sleep(PERIOD)
-                tick()
-
-        threading.Thread(target=lambda: asyncio.run(ticking()), daemon=True).start()
+        in_a_thread(loop)
+    if kind in CLOCKS:
+        node.create_timer(PERIOD, tick, clock=Clock(clock_type=CLOCKS[kind]))
     elif kind == 'posted':
-        # A lock with a timeout that another thread releases before.
-        lock = threading.Lock()
-
-        def post():
-            while rclpy.ok():
-                time.sleep(PERIOD)
-                lock.release()
-
-        lock.acquire()
-        threading.Thread(target=post, daemon=True).start()
-        forever(lambda: lock.acquire(timeout=5.0))
-    elif kind == 'two':
-        # Due at once: the timer of the thread that is older.
-        node.create_timer(PERIOD, lambda: said.append('timer'), clock=Clock())
-
-        def both():
-            said.append('thread')
-            publisher.publish(String(data=' '.join(said)))
-            said.clear()
-
-        def loop():
-            while rclpy.ok():
-                time.sleep(PERIOD)
-                both()
-
-        threading.Thread(target=loop, daemon=True).start()
-    elif kind == 'children':
-        # They take what waits in this process for files by and by.
-        reader, _ = os.pipe()
-
-        def children():
-            while rclpy.ok():
-                time.sleep(PERIOD)
-                subprocess.run([sys.executable, '-c', 'import time; time.sleep(0.001)'], check=True)
-                tick()
-
-        threading.Thread(target=children, daemon=True).start()
-        threading.Thread(
-            target=lambda: [select.select([reader], [], [], 0.007) for _ in range(100)], daemon=True
-        ).start()
+        in_a_thread(post)
+    elif kind == 'asyncio':
+        in_a_thread(lambda: asyncio.run(tick_in_event_loop(tick)))
     elif kind == 'deadlock':
         mutex = threading.Lock()
         node.create_subscription(String, 'poke', lambda _: mutex.acquire(), 10)
     elif kind == 'later':
 
         def begin_to_wait(_):
-            threading.Thread(target=lambda: threading.Event().wait(0.05)).start()
+            in_a_thread(lambda: threading.Event().wait(0.05))
 
         node.create_subscription(String, 'poke', begin_to_wait, 10)
     elif kind == 'alarm':
         signal.signal(signal.SIGALRM, lambda *_: None)
         signal.setitimer(signal.ITIMER_REAL, PERIOD, PERIOD)
-    if kind == 'waiting':
+
+
+def start_two(node, publisher):
+    """Start a timer and a thread that are due at once: the timer, of the older thread, comes first."""
+    said = []
+    node.create_timer(PERIOD, lambda: said.append('timer'), clock=Clock())
+
+    def loop():
+        while rclpy.ok():
+            time.sleep(PERIOD)
+            publisher.publish(String(data=' '.join(['two', *said, 'thread'])))
+            said.clear()
+
+    in_a_thread(loop)
+
+
+def main(kinds):
+    if kinds == ['late']:
+        time.sleep(3.0)
+    rclpy.init()
+    node = rclpy.create_node('ticker')
+    publisher = node.create_publisher(String, 'tick', 100)
+    if kinds == ['waiting']:
         client = node.create_client(Trigger, 'offered')
         while not client.wait_for_service(timeout_sec=1.0):
             pass
-        node.create_timer(PERIOD, tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    begin = time.monotonic()
+
+    def tick(kind):
+        publisher.publish(String(data=f'{kind} {time.monotonic() - begin:.3f}'))
+
+    def start_all(_=None):
+        for kind in kinds:
+            start(kind, node, lambda kind=kind: tick(kind))
+
+    if len(kinds) > 1:
+        node.create_subscription(String, 'poke', start_all, 10)
+    else:
+        start_all()
+    if kinds == ['two']:
+        start_two(node, publisher)
     with suppress(KeyboardInterrupt, ExternalShutdownException):
-        while kind == 'once':
+        while kinds == ['once']:
             rclpy.spin_once(node, timeout_sec=PERIOD)
-            tick()
+            tick('once')
         rclpy.spin(node)
 
 
-main()
+main(sys.argv[1 : sys.argv.index('--ros-args')])
