@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 
 import pytest
 from builtin_interfaces.msg import Time
@@ -78,12 +77,7 @@ def test_timers_on_a_wall_clock_run_on_wall_time(lockstep):
     )
     with pytest.warns(UserWarning, match=r'a timer of node /lockstep .* 0.02 s is not on the clock'):
         lockstep.run_for(100.0)
-    before = len(ticks)
-    assert before < 50
-    deadline = time.monotonic() + 10.0
-    while len(ticks) == before and time.monotonic() < deadline:
-        lockstep.step(at_most=0.001)
-    assert len(ticks) > before
+    assert len(ticks) < 50
 
 
 def test_limits_of_a_quality_of_service_run_on_wall_time(lockstep):
@@ -96,19 +90,15 @@ def test_limits_of_a_quality_of_service_run_on_wall_time(lockstep):
         'the publisher of /stale of node /lockstep has a deadline of 0.1 s',
         'the publisher of /stale of node /lockstep has a lifespan of 2 s',
     ]
-    # Once.
-    lockstep.node.create_publisher(Vector3, 'other', 10)
-    lockstep.run_for(1.0)
 
 
-def test_a_node_that_was_created_but_not_added_is_named(lockstep):
-    idle, forgotten = Node('idle'), Blinker('forgotten')
+def test_a_node_that_was_created_but_not_added_is_named_once(lockstep):
+    forgotten = Blinker('forgotten')
     with pytest.warns(UserWarning, match='node /forgotten was created, but not added') as warned:
         lockstep.run_for(1.0)
+    lockstep.run_for(1.0)
     assert len(warned) == 1
-    lockstep.run_until(lambda: True, 1.0)
-    for node in (idle, forgotten):
-        node.destroy_node()
+    forgotten.destroy_node()
 
 
 # --- Advancing
@@ -201,17 +191,6 @@ def test_jump_callbacks_of_a_users_clock_are_called(lockstep):
     assert jumps == [5_000_000_000, -3_000_000_000]
     assert len(heard) == 2
     handle.unregister()
-
-
-@pytest.mark.lockstep(args=['--ros-args', '-r', 'other:/clock:=/other_clock'])
-def test_a_node_with_another_topic_for_its_clock_follows_that(lockstep):
-    other, blinker = lockstep.add(Blinker('other')), lockstep.add(Blinker())
-    message = ClockMessage()
-    message.clock.sec = 77
-    lockstep.publish('/other_clock', message)
-    lockstep.run_for(0.1)
-    assert other.get_clock().now().nanoseconds == 77_000_000_000
-    assert blinker.get_clock().now().nanoseconds == lockstep.now
 
 
 # --- Nodes

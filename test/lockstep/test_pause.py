@@ -34,7 +34,6 @@ def test_blinks(lockstep):
 @pytest.fixture
 def stops(monkeypatch):
     """Return the stops in a debugger that does what its `act` says."""
-    found = []
 
     class Stops(list):
         act = staticmethod(lambda world: None)
@@ -148,23 +147,18 @@ class Sleeper(Blinker):
             time.sleep(1.2)
 
 
-def test_nothing_has_a_limit_of_time_from_then_on(stops):
-    for paused in (True, False):
-        with Lockstep(patience=0.5) as world:
-            world.create(lambda: Sleeper(rate=10.0))
-            if paused:
-                world.pause_at(0.1)
-                world.run_for(0.5)
-            else:
-                with pytest.raises(LockstepError, match='has not returned for'):
-                    world.run_for(0.5)
-
-
-def test_nor_has_a_callback_in_which_a_debugger_is(monkeypatch):
-    monkeypatch.setattr(_guard, 'debugger_is_active', lambda: True)
+@pytest.mark.parametrize('how', ['not', 'paused before', 'in a debugger'])
+def test_callbacks_have_a_limit_of_time_only_without_a_debugger(how, stops, monkeypatch):
+    monkeypatch.setattr(_guard, 'debugger_is_active', lambda: how == 'in a debugger')
     with Lockstep(patience=0.5) as world:
         world.create(lambda: Sleeper(rate=10.0))
-        world.run_for(0.5)
+        if how == 'paused before':
+            world.pause_at(0.1)
+        if how == 'not':
+            with pytest.raises(LockstepError, match='has not returned for'):
+                world.run_for(0.5)
+        else:
+            world.run_for(0.5)
 
 
 @pytest.mark.process
@@ -195,26 +189,16 @@ def test_pdb_of_pytest_has_the_world(tmp_path):
 
 
 @pytest.mark.process
-@pytest.mark.parametrize('paused', [True, False])
-def test_a_process_may_take_its_time(paused, stops):
+def test_a_process_may_take_its_time(lockstep, stops):
     """As one that a debugger stops. Without a pause that is an error."""
     program = [sys.executable, str(Path(__file__).with_name('external_nodes.py')), 'echo']
-    with Lockstep() as world:
-        if paused:
-            world.pause_at(0.1)
-        process = world.start(program, patience=1.0)
-        world.publish('echo/in', Float64(data=1.0))
-        process.signal(signal.SIGSTOP)
-        goes_on = threading.Timer(2.5, process.signal, [signal.SIGCONT])
-        goes_on.start()
-        if paused:
-            begin = time.monotonic()
-            world.publish('echo/in', Float64(data=2.0))
-            assert time.monotonic() - begin > 1.5
-            assert world.last('echo/out').frame_id == '2'
-            world.run_for(0.2)
-            assert f'pid {process.pid}: ' in stops[0][1]
-        else:
-            with pytest.raises(LockstepError, match='not quiet within 1 s'):
-                world.publish('echo/in', Float64(data=2.0))
-        goes_on.join()
+    lockstep.pause_at(0.1)
+    process = lockstep.start(program, patience=1.0)
+    process.signal(signal.SIGSTOP)
+    goes_on = threading.Timer(2.5, process.signal, [signal.SIGCONT])
+    goes_on.start()
+    lockstep.publish('echo/in', Float64(data=2.0))
+    goes_on.join()
+    assert lockstep.last('echo/out').frame_id == '2'
+    lockstep.run_for(0.2)
+    assert f'pid {process.pid}: ' in stops[0][1]
