@@ -39,13 +39,12 @@ def test_kind_of_executor(ros, monkeypatch, isolated, with_info, kind, without_e
 
 def test_nodes_of_this_package_run_on_events(ros):
     executor = make_executor(ros.context, isolated=False)
-    nodes = [create(context=ros.context) for create in (VirtualRobot, GoToGoal, WheelBridge)]
-    for node in nodes:
+    for node_class in (VirtualRobot, GoToGoal, WheelBridge):
+        node = node_class(context=ros.context)
         executor.add_node(node)
         assert not executor.fair
-    executor.shutdown()
-    for node in nodes:
         node.destroy_node()
+    executor.shutdown()
 
 
 @pytest.mark.parametrize('isolated', [False, True])
@@ -75,13 +74,9 @@ def test_loop_ends_after_a_time_or_on_a_signal_that_is_new(create):
 
     with create() as runner:
         runner.add(lambda: VirtualRobot(context=runner.context))
-        start = runner.seconds()
-        assert not runner.spin(never, timeout=0.1, signals=signals)
-        assert runner.seconds() - start > 0.1
         # The condition comes first, also when the time is over.
         assert runner.spin(lambda: True, timeout=-1.0)
         signals.count = 1
-        calls.clear()
         assert not runner.spin(never, signals=signals)
         assert calls == [1]
         start = runner.seconds()
@@ -114,16 +109,10 @@ def test_every_node_is_stopped_before_any_is_destroyed():
 def test_a_node_that_cannot_be_created_leaves_nothing_in_the_graph():
     override = 'qos_overrides./odom.publisher.depth:=-1'
     name = 240 * 'n'
-    with (
-        ros_context(
-            ['test', '--ros-args', '-p', override, '-r', f'cancel_goal:=/a/{name}/b']
-        ) as context,
-        running(context, isolated=True) as runner,
-    ):
+    arguments = ['test', '--ros-args', '-p', override, '-r', f'cancel_goal:=/a/{name}/b']
+    with ros_context(arguments) as context, running(context, isolated=True) as runner:
         with pytest.raises(UserError, match='qos_overrides of /odom are invalid'):
             runner.add(lambda: VirtualRobot(context=context))
-        with pytest.raises(UserError):
-            runner.add(lambda: GoToGoal(context=context, namespace=name))
         with pytest.raises(UserError):
             runner.add(lambda: GoalClient('client', np.zeros((1, 3)), context, namespace=name))
         observer = runner.add(lambda: Node('observer', context=context))
@@ -162,7 +151,6 @@ INVALID = {
     'long name of a node': (('-r', f'__node:={300 * "n"}'), 'got 301'),
     'long topic of one node': (('-r', f'virtual_robot:odom:={300 * "t"}'), "'virtual_robot:odom:=tttt"),
     # Each of these is short enough by itself.
-    'long services of a node': (('-r', f'__node:={240 * "n"}'), 'Invalid service name: topic length'),
     'long together': (
         ('-r', f'__ns:=/{120 * "n"}', '-r', f'reset_odometry:={130 * "s"}'),
         'topic length should not exceed',

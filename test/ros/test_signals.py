@@ -46,33 +46,35 @@ def test_a_second_signal_ends_a_process_that_hangs():
     assert child.communicate()[1] == 'tool: ended by a second signal\n'
 
 
-AT_ONCE = """
-import os, signal, sys
-from diffdrive_jacobian.signals import Signals
-caught = Signals(lambda: os._exit(7))
-caught.catch()
-if sys.argv[1] == 'before':
-    os.kill(os.getpid(), signal.SIGINT)
-with caught.ending_at_once():
-    print('reached', flush=True)
-    if sys.argv[1] == 'while':
-        os.kill(os.getpid(), signal.SIGINT)
-        print('too late', flush=True)
-os.kill(os.getpid(), signal.SIGINT)
-print('counted', caught.count, flush=True)
-"""
+@pytest.fixture
+def handlers():
+    """Restore the handlers of signals."""
+    before = {number: signal.getsignal(number) for number in module.CAUGHT}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
-@pytest.mark.process
-@pytest.mark.parametrize(
-    ('when', 'code', 'printed'),
-    [('before', 7, ''), ('while', 7, 'reached\n'), ('after', 0, 'reached\ncounted 1\n')],
-)
-def test_what_leaves_nothing_is_ended_at_once(when, code, printed):
-    ended = subprocess.run(
-        [sys.executable, '-c', AT_ONCE, when], capture_output=True, text=True, check=False
-    )
-    assert (ended.returncode, ended.stdout, ended.stderr) == (code, printed, '')
+@pytest.mark.parametrize('number', module.CAUGHT)
+def test_signals_are_counted_and_end_what_leaves_nothing_at_once(handlers, number):
+    ends = []
+    caught = Signals(lambda: ends.append(caught.count))
+    caught.catch()
+    os.kill(os.getpid(), number)
+    assert (caught.count, ends) == (1, [])
+    # Also by one that was caught before.
+    with caught.ending_at_once():
+        assert ends == [1]
+        # Once.
+        os.kill(os.getpid(), number)
+    caught.count = 0
+    with caught.ending_at_once():
+        os.kill(os.getpid(), number)
+        assert ends == [1, 1]
+    with caught.ending_at_once():
+        pass
+    os.kill(os.getpid(), number)
+    assert caught.count == 2
 
 
 class Watched:
@@ -125,15 +127,10 @@ def test_a_process_that_reads_the_count_is_given_time(monkeypatch):
     watched.until_ended()
 
 
-def test_a_process_that_exits_by_itself_is_not_ended(monkeypatch):
-    handlers = {number: signal.getsignal(number) for number in module.CAUGHT}
-    try:
-        watched = Watched(monkeypatch, grace=0.2)
-        watched.send(signal.SIGINT)
-        watched.send(signal.SIGINT)
-        watched.signals.ignore()
-        watched.until_ended()
-        assert not watched.ended.is_set()
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+def test_a_process_that_exits_by_itself_is_not_ended(monkeypatch, handlers):
+    watched = Watched(monkeypatch, grace=0.2)
+    watched.send(signal.SIGINT)
+    watched.send(signal.SIGINT)
+    watched.signals.ignore()
+    watched.until_ended()
+    assert not watched.ended.is_set()
