@@ -263,18 +263,6 @@ class Busy(Echo):
             pass
 
 
-class Napping(Echo):
-    """A thread that polls on wall time."""
-
-    def __init__(self, name):
-        super().__init__(name)
-        threading.Thread(target=self.poll, daemon=True).start()
-
-    def poll(self):
-        while not stopped.is_set():
-            time.sleep(0.01)
-
-
 class Mortal(Echo):
     """Ends with the exit code that it receives."""
 

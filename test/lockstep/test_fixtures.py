@@ -7,17 +7,22 @@ import math
 import os
 import subprocess
 import sys
+import time
 import warnings
 
 import pytest
-from fork_server import forked
 from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from support.domains import domain_id
+from support.harness import PATIENCE
 from support.inner_sessions import OPTIONS, SETTING, draw_quickly, run_inner
 from support.ros_messages import twist
 
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.faults import EncoderSteps, Kill
+from diffdrive_jacobian.ros.runner import ros_context
+from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.testing.fixtures import MAX_LENGTH, artifact_name, name_beside_the_file
 
 PLUGIN = 'diffdrive_jacobian.testing.fixtures'
@@ -169,38 +174,22 @@ def test_a_robot_has_its_pose_by_odometry_and_its_true_one(lockstep, robot_at):
     assert 1e-4 < math.dist(robot.pose[:2], robot.truth[:2]) < 0.03
 
 
-PARALLEL = """
-    import os, pathlib, time
-
-    def test_hears_only_itself(lockstep, robot_at):
-        robot_at()
-        odom = lockstep.listen(Odometry, 'odom')
-        twist = Twist()
-        twist.linear.x = float(os.environ['SPEED'])
-        me, other = (pathlib.Path(os.environ[name]) for name in ('ME', 'OTHER'))
-        me.touch()
-        begun = time.monotonic()
-        while not other.exists():
-            assert time.monotonic() - begun < 30.0
-        for _ in range(20):
-            lockstep.publish('cmd_vel', twist)
-            lockstep.run_for(0.1)
-        assert odom[-1].pose.pose.position.x == pytest.approx(lockstep.elapsed * twist.linear.x)
-        assert len(odom) == round(50 * lockstep.elapsed)
-"""
-
-
-@pytest.mark.process
-def test_parallel_worlds_do_not_hear_each_other(pytester):
-    """Two processes at once, on one domain, with one topic."""
-    pytester.makepyfile(SETTING + PARALLEL)
-    session = 'import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))'
-    processes = []
-    for me, other, speed in (('a', 'b', '1.0'), ('b', 'a', '-1.0')):
-        environment = {**os.environ, 'SPEED': speed, 'ME': me, 'OTHER': other}
-        environment.pop('ROS_AUTOMATIC_DISCOVERY_RANGE')
-        processes.append(forked.Popen(session, ['-q', *OPTIONS], cwd=pytester.path, env=environment))
-    assert [process.wait(timeout=60) for process in processes] == [0, 0]
+def test_no_other_node_sees_those_of_a_world(monkeypatch):
+    """On one domain, also in one process, where nodes of two contexts see each other."""
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id()))
+    with Lockstep() as world, ros_context(['test']) as context, ros_context(['test']) as other:
+        world.node.create_publisher(Odometry, 'odom', 10)
+        observer = Node('observer', context=context)
+        later = Node('later', context=other)
+        later.create_publisher(Odometry, 'odom', 10)
+        deadline = time.monotonic() + PATIENCE
+        while observer.count_publishers('odom') == 0:
+            assert time.monotonic() < deadline
+        assert observer.count_publishers('odom') == 1
+        assert world.node.count_publishers('odom') == 1
+        for node in (observer, later):
+            node.destroy_node()
 
 
 # --- Reports

@@ -352,43 +352,25 @@ def test_what_a_node_sends_from_a_thread_of_its_own_is_an_error(lockstep):
     assert lockstep.last('spectrum') == Vector3()
 
 
-def test_what_a_helper_that_was_not_added_sends_from_a_thread_is_an_error(lockstep):
-    """As a node that publishes through a second node of its own."""
-    node = lockstep.add(Node('composed'))
-    helper = Threaded('helper')
-    node.create_timer(0.1, lambda: in_a_thread(helper.publish))
-    # Nobody receives it.
-    with pytest.warns(UserWarning, match='node /helper was created, but not added'):
-        lockstep.run_for(0.1)
-    lockstep.listen(Vector3, 'spectrum')
-    words = (
-        r"node /helper publishes /spectrum from a thread .*\('worker'\): .* add it with lockstep\.add"
-    )
-    with refused(words) as caught:
-        lockstep.run_for(0.1)
-    assert '  /spectrum: 2 from /helper, ' in str(caught.value)
-
-
-def test_what_is_sent_before_a_node_was_added_or_in_another_context_does_not_count(lockstep):
-    """A node may be created in a thread."""
-    lockstep.listen(Vector3, 'spectrum')
+@pytest.mark.filterwarnings('ignore:node /helper was created, but not added')
+def test_what_a_node_that_was_not_added_sends_from_a_thread_is_an_error_if_it_is_received(lockstep):
+    """A node may be created in a thread, and publish there."""
     created = []
 
     def create():
-        created.append(Threaded())
+        created.append(Threaded('helper'))
         created[0].publish()
 
     in_a_thread(create)
-    node = lockstep.add(created[0])
-    lockstep.run_for(0.1)
-    assert lockstep.last('spectrum') == Vector3()
-    with Context() as context:
-        stranger = Threaded('stranger', context=context)
-        in_a_thread(stranger.publish)
+    lockstep.listen(Vector3, 'spectrum')
+    words = r"/helper publishes /spectrum from a thread .*\('worker'\): .* add it with lockstep\.add"
+    in_a_thread(created[0].publish)
+    with refused(words):
         lockstep.run_for(0.1)
-        stranger.destroy_node()
-    in_a_thread(node.publish)
-    with refused(PUBLISHES):
+    lockstep.add(created[0])
+    lockstep.run_for(0.1)
+    in_a_thread(created[0].publish)
+    with refused('/helper publishes /spectrum from a thread of its own'):
         lockstep.run_for(0.1)
 
 
@@ -415,12 +397,7 @@ def test_a_controller_of_stamped_twists_beside_a_robot_of_others_is_explained(lo
 
     match = '/cmd_vel cannot have the type geometry_msgs/msg/TwistStamped: .* enable_stamped_cmd_vel'
     for create in (Stamped, lambda: lockstep.create(Stamped)):
-        with pytest.raises(LockstepError, match=match):
+        with refused(match):
             create()
-    node = lockstep.add(Node('late'))
-    node.create_timer(0.1, lambda: node.create_subscription(TwistStamped, 'cmd_vel', print, 10))
-    with pytest.raises(LockstepError, match=match):
-        lockstep.run_for(0.2)
-    lockstep.remove(node)
-    with pytest.raises(LockstepError, match=match):
+    with refused(match):
         lockstep.start([sys.executable, '-c', STAMPED])
