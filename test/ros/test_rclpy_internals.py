@@ -1,7 +1,8 @@
 """The internals of rclpy that `ros.rclpy_internals` relies on, if no other test fails without them.
 
 If a test fails with a new release of rclpy, the function that it names must change. What receives or
-sends messages without an executor, or notices them, is tested by worlds in lockstep and the recorder.
+sends messages without an executor, notices them, runs timers or tasks, is tested by worlds in lockstep
+and the recorder.
 """
 
 from __future__ import annotations
@@ -13,12 +14,10 @@ import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.clock import Clock
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile
-from rclpy.task import Future
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
@@ -43,23 +42,6 @@ def recorder(calls):
         return wrapped
 
     return wrap
-
-
-def echo(request, response):
-    return response
-
-
-def clock_message(seconds):
-    message = ClockMessage()
-    message.clock.sec = seconds
-    return message
-
-
-@pytest.fixture
-def single(ros):
-    executor = SingleThreadedExecutor(context=ros.context)
-    yield executor
-    executor.shutdown()
 
 
 @pytest.fixture
@@ -128,8 +110,10 @@ def test_clock_callback_is_wrapped_also_later(ros):
     calls = []
     internals.wrap_clock_callback(node, recorder(calls))
     node.set_parameters([Parameter('use_sim_time', value=True)])
-    ros.talk(ClockMessage, '/clock').publish(clock_message(7))
-    ros.until(lambda: calls == [(clock_message(7),)], 'the wrapper receives the clock')
+    message = ClockMessage()
+    message.clock.sec = 7
+    ros.talk(ClockMessage, '/clock').publish(message)
+    ros.until(lambda: calls == [(message,)], 'the wrapper receives the clock')
     assert node.get_clock().now().nanoseconds == 7 * SECOND
 
 
@@ -146,7 +130,7 @@ def test_service_callback_is_wrapped(ros):
 
 def test_every_response_to_a_request_is_counted(ros):
     for name in ('one', 'two'):
-        ros.add(Node, node_name=name).create_service(SetBool, 'shared', echo)
+        ros.add(Node, node_name=name).create_service(SetBool, 'shared', lambda _, response: response)
     client = ros.peer.create_client(SetBool, 'shared')
     ros.until(lambda: ros.peer.count_services('shared') == 2, 'both servers are discovered')
     responses = []
@@ -191,19 +175,6 @@ def test_a_timer_is_restarted_or_keeps_an_earlier_expiry(lockstep, change, elaps
     lockstep.run_for(0.6)
     assert expired[0] == start + round(first * SECOND)
     assert timer.timer_period_ns == round(period * SECOND)
-
-
-def test_timer_handle_knows_when_the_timer_expires(ros):
-    timer = ros.peer.create_timer(100.0, lambda: None, autostart=False)
-    handle = internals.timer_handle(timer)
-    assert handle.time_until_next_call() is None
-    timer.reset()
-    assert 0 < handle.time_until_next_call() <= 100 * SECOND
-    handle.call_timer()
-    assert handle.time_until_next_call() > 100 * SECOND
-    ros.peer.destroy_timer(timer)
-    with pytest.raises(internals.RCLError):
-        handle.time_until_next_call()
 
 
 # --- Messages
@@ -277,17 +248,3 @@ def test_entities_of_a_node_are_counted(node):
 def test_a_queue_without_a_limit_has_the_greatest_depth():
     assert queue_depth(QoSProfile(depth=3)) == 3
     assert queue_depth(QoSProfile(history=HistoryPolicy.KEEP_ALL)) == sys.maxsize
-
-
-def test_a_task_runs_to_the_next_await_when_it_is_called(ros):
-    future = Future()
-
-    async def wait_for(future):
-        return await future
-
-    task = internals.new_task(wait_for, (), {'future': future}, ros.executor)
-    task()
-    assert not task.done()
-    future.set_result('done')
-    task()
-    assert task.result() == 'done'
