@@ -30,6 +30,7 @@ from diffdrive_jacobian.diagnosis.machine import (
     shared_memory,
 )
 from diffdrive_jacobian.parameters.wheels import Dimensions
+from diffdrive_jacobian.text import listed
 
 TWIST, STAMPED = 'geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped'
 ODOMETRY, STATES = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/JointState'
@@ -136,6 +137,11 @@ def test_wheels_that_differ_are_a_problem():
         'for which its wheel speeds are computed: it drives 1.2 times and turns 0.8 times as fast as '
         'commanded by /bridge',
     )
+
+
+def test_names_are_listed():
+    assert listed(['/b', '/a', '/b']) == '/a and /b (2 times)'
+    assert listed(['/c', '/b', '/a']) == '/a, /b and /c'
 
 
 # --- Clocks
