@@ -14,7 +14,7 @@ from rclpy.task import Future
 from std_msgs.msg import Float64, Header, String
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.faults import ClockPause, Loss
+from diffdrive_jacobian.faults import ClockPause, Loss, TimeJump
 from diffdrive_jacobian.testing import Lockstep
 
 pytestmark = pytest.mark.process
@@ -139,13 +139,16 @@ class TestMessages:
             return response
 
         received = talking.listen(Header, 'asking/out')
+        publisher = talking.node.create_publisher(Float64, 'asking/in', 10)
         begin = talking.now
         with answering(talking, 'asking/ask', answer):
-            talking.node.create_publisher(Float64, 'asking/in', 10).publish(Float64())
+            for _ in range(2):
+                publisher.publish(Float64())
             talking.run_for(0.1)
             slow.set_result(None)
             talking.run_for(0.1)
-        assert [(stamp(one), float(one.frame_id)) for one in received] == [(begin, -1.0)]
+        assert numbers(received) == [-1.0, -1.0]
+        assert [stamp(one) for one in received] == [begin, begin]
 
 
 def test_an_action_of_a_process(lockstep):
@@ -235,12 +238,16 @@ class TestTime:
         ticking.run_for(0.1)
         assert len(received) == 2
 
-    def test_no_timer_expires_while_the_clock_stands_still(self, ticking):
-        received = ticking.listen(Header, 'ticker/out')
-        ticking.inject(ClockPause(start=ticking.world_seconds + 0.1, duration=0.5))
+    def test_faults_of_the_clock_affect_timers(self, ticking):
+        """None expires while it stands still, and one when it jumps forward."""
+        received, begin = ticking.listen(Header, 'ticker/out'), ticking.world_seconds
+        ticking.inject(ClockPause(start=begin + 0.1, duration=0.5), TimeJump(5.0, start=begin + 0.8))
         ticking.run_for(0.15)
         before = len(received)
         ticking.run_for(0.4)
         assert len(received) == before
-        ticking.run_for(0.15)
+        ticking.run_for(0.2)
         assert len(received) > before
+        now = ticking.now
+        ticking.run_for(0.06)
+        assert stamp(received[-1]) > now + 5 * SECOND

@@ -20,7 +20,7 @@ from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from rclpy.wait_for_message import wait_for_message
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import make
 from support.ros_messages import goal
@@ -344,6 +344,10 @@ def test_the_report_has_bytes_and_values_that_messages_do_not_allow(lockstep):
     assert 'last at 1 s: Vector3(x=0.5)' in lockstep.report()
     publisher.publish(b'\0\1')
     assert 'last at 1 s: 2 serialized bytes' in lockstep.report()
+    publisher, message = lockstep.node.create_publisher(Header, 'b', 10), Header(frame_id='odom')
+    publisher.publish(message)
+    message._stamp = None
+    assert "frame_id='odom'" in lockstep.report()
 
 
 def test_last_is_the_last_message_of_all_publishers(lockstep):
