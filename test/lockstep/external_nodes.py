@@ -283,17 +283,6 @@ NODES = {
 }
 
 
-def command(*names):
-    """Return the command that starts a process with some of these nodes."""
-    return [sys.executable, __file__, *names]
-
-
-def send(world, name, *values):
-    """Publish numbers on the input of a node."""
-    for value in values:
-        world.publish(f'{name}/in', Float64(data=float(value)))
-
-
 def spin(executor):
     while not stopped.is_set():
         executor.spin_once(timeout_sec=0.1)

@@ -6,7 +6,7 @@ import itertools
 from contextlib import contextmanager
 
 import pytest
-from forked_nodes import SECOND, command, numbers, send, stamp, started_in_forks
+from external_calls import SECOND, command, numbers, send, stamp
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import GetParameters
 from rclpy.action import ActionClient
@@ -18,13 +18,6 @@ from diffdrive_jacobian.faults import ClockPause, Loss, TimeJump
 from diffdrive_jacobian.testing import Lockstep
 
 pytestmark = pytest.mark.process
-
-
-@pytest.fixture(autouse=True, scope='module')
-def forks():
-    """Nodes of `external_nodes` run in forks. Other programs are started as usual."""
-    with started_in_forks():
-        yield
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import sys
 import time
 
 import pytest
-from external_nodes import command, send
+from external_calls import command, send
 from rcl_interfaces.srv import SetParameters
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter

@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 
 import pytest
-from forked_nodes import SECOND, command, numbers, send, stamp, started_in_forks
+from external_calls import SECOND, command, numbers, send, stamp
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
@@ -30,13 +30,6 @@ VIRTUAL_ROBOT, GO_TO_GOAL = (
     [sys.executable, '-c', PROGRAM.format(name)] for name in ('virtual_robot', 'go_to_goal')
 )
 QUICK = ['--ros-args', '-p', 'kp:=24.0', '-p', 'kv:=12.0']
-
-
-@pytest.fixture(autouse=True, scope='module')
-def forks():
-    """Nodes of `external_nodes` run in forks. Other programs are started as usual."""
-    with started_in_forks():
-        yield
 
 
 # --- Faults

@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from fork_server import forked
 from rclpy.node import Node
 from support.domains import domain_id
+from support.processes import run_python
 
 from diffdrive_jacobian.ros import fastdds_profiles
 from diffdrive_jacobian.ros.fastdds_profiles import (
@@ -140,7 +140,7 @@ def test_messages_are_received_through_udp(monkeypatch):
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id()))
     for switch, expected in (('1', False), ('0', True)):
         monkeypatch.setenv(SWITCH, switch)
-        ended = forked.run(RECEIVING, timeout=60)
+        ended = run_python(RECEIVING, timeout=60)
         assert ended.returncode == 0
         assert bool(re.search(r'^fastrtps_port\d+_el$', ended.stdout, re.MULTILINE)) == expected
 

@@ -76,7 +76,6 @@ class Connecting:
             LockstepError: They have not discovered each other, or cannot take part.
         """
         self._discover(matching)
-        self._waiting.wait()
         self._discovery.check_order()
         self._learn_how_it_waits()
         self._check_silent()
@@ -103,6 +102,7 @@ class Connecting:
             self._match(timeout, matched_by)
             known = len(discovery.relays)
             self.confirm(timeout)
+            self._wait_and_learn()
             graph_changed(domain.node)
             if not discovery.learn() or len(discovery.relays) > known:
                 continue
@@ -175,7 +175,7 @@ class Connecting:
             time.sleep(UNCONFIRMED)
             discovery.learn()
             if len(discovery.relays) == known:
-                self._waiting.wait()
+                self._wait_and_learn()
 
     def _await_response(self, name: str, allowance: Allowance) -> None:
         """Ask a node for a parameter until it has responded to the last request, so to all of them."""
@@ -210,7 +210,10 @@ class Connecting:
         domain.node.destroy_client(client)
 
     def _wait_and_learn(self) -> None:
-        """Wait until the process is quiet. Before it spins, it may wait for a service of the world."""
+        """Wait until the process is quiet, and learn what it creates meanwhile.
+
+        Before its nodes spin, it may wait for a service of the world.
+        """
         quiet = self._domain.quiet
         patience = Allowance(quiet, self._domain.command.patience)
         while not (quiet.is_quiet() or quiet.waits_in_callback or patience.is_used_up()):

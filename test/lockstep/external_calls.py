@@ -1,0 +1,31 @@
+"""How tests start nodes of `external_nodes`, send them numbers, and read what they answer."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from std_msgs.msg import Float64
+
+SECOND = 1_000_000_000
+
+
+def command(*names):
+    """Return the command that starts a process with some nodes."""
+    return [sys.executable, str(Path(__file__).with_name('external_nodes.py')), *names]
+
+
+def send(world, name, *values):
+    """Publish numbers on the input of a node."""
+    for value in values:
+        world.publish(f'{name}/in', Float64(data=float(value)))
+
+
+def numbers(messages):
+    """Return the numbers that nodes have published."""
+    return [float(one.frame_id) for one in messages]
+
+
+def stamp(message):
+    """Return the time of a message of a node (ns)."""
+    return message.stamp.sec * SECOND + message.stamp.nanosec
