@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import pytest
 from faults_nodes import LATCHED, Sink, Source, in_time, play
-from rclpy.node import Node
 from std_msgs.msg import Int64, String
 
 from diffdrive_jacobian import faults
@@ -51,15 +50,7 @@ def test_messages_arrive(lockstep, how):
     assert play(lockstep, *injected) == expected
 
 
-def test_events_name_what_has_happened_to_which_messages(lockstep):
-    play(lockstep, faults.Loss('count', start=0.3, duration=0.3), faults.Stale('count', start=0.65))
-    assert [(event.time_ns / 1e9, event.what) for event in lockstep.fault_events] == [
-        (0.3, 'begins'),
-        (0.6, 'messages 3 to 5 of /count to /sink lost, from 0.3 s to 0.5 s'),
-        (0.6, 'ends: 3 of 3 messages of /count to /sink'),
-        (0.65, 'begins'),
-        (1.0, 'messages 4 to 7 of /count to /sink changed, from 0.7 s to 1 s'),
-    ]
+# --- Random numbers
 
 
 def test_a_burst_loses_messages_in_a_row(lockstep):
@@ -83,37 +74,24 @@ def test_a_random_delay_keeps_the_order_also_after_its_end_and_reordering_does_n
     assert {number for number, _ in got} >= set(range(21, 39))
 
 
-def test_a_delay_ends_when_its_last_message_has_arrived(lockstep):
-    delay = faults.Delay('count', 1.0, start=0.25, duration=0.2)
-    got = play(lockstep, delay, seconds=0.6)
-    assert got == in_time(1, 2)
-    report = lockstep.report()
-    assert f'{delay!r}: over, its last message arrives at 1.4 s, 2 of 2 messages' in report
-    lockstep.run_for(1.4)
-    # The two that were delayed, and those that wait behind them.
-    assert got[2:6] == [(3, 1300.0), (4, 1400.0), (5, 1400.0), (6, 1400.0)]
-    total = '2 of 2 messages of /count to /sink and 9 behind them'
-    assert [(event.time_ns / 1e9, event.what) for event in lockstep.fault_events] == [
-        (0.25, 'begins'),
-        (0.45, 'messages 3 to 4 of /count to /sink delayed by 1 s, from 0.3 s to 0.4 s'),
-        (0.45, 'is over, its last message arrives at 1.4 s'),
-        (1.4, 'messages 5 to 13 of /count to /sink delayed by 0.1 s to 0.9 s, from 0.5 s to 1.3 s'),
-        (1.4, f'ends: {total}'),
-    ]
-    assert f'{delay!r}: ended, {total}' in lockstep.report()
-
-
-def test_a_copy_arrives_before_what_is_published_after_it(lockstep):
-    """Both at one time."""
-    order = []
-    for name in 'ab':
-        lockstep.node.create_subscription(Int64, name, lambda m, name=name: order.append(name), 10)
-    a, b = (lockstep.node.create_publisher(Int64, name, 10) for name in 'ab')
-    lockstep.inject(faults.Duplicate('a', copies=2, node='lockstep'))
-    a.publish(Int64())
-    b.publish(Int64())
-    lockstep.settle()
-    assert order == ['a', 'a', 'a', 'b']
+def test_each_subscription_and_fault_has_random_numbers_which_depend_on_nothing_else(lockstep):
+    loss = faults.Loss('count', probability=0.5)
+    one, two = (lockstep.add(Sink(name)) for name in ('one', 'two'))
+    lockstep.inject(loss, seed=7)
+    lockstep.add(Source())
+    lockstep.run_for(5.0)
+    alone = one.numbers
+    assert alone != two.numbers
+    lockstep.close()
+    with Lockstep() as world:
+        later = world.add(Sink('three')), world.add(Sink('one'))
+        world.inject(faults.Loss('another', node='one'), loss, seed=7)
+        world.add(Source())
+        world.run_for(5.0)
+        assert later[1].numbers == alone
+    with Lockstep() as world:
+        # An equal fault loses others.
+        assert 2 < len(play(world, loss, loss, seconds=5.0, seed=7)) < 20
 
 
 # --- Several subscriptions
@@ -135,24 +113,29 @@ def test_who_is_affected(lockstep):
     assert named.numbers == sink.numbers == two.numbers == []
 
 
-def test_each_subscription_and_fault_has_random_numbers_which_depend_on_nothing_else(lockstep):
-    loss = faults.Loss('count', probability=0.5)
-    one, two = (lockstep.add(Sink(name)) for name in ('one', 'two'))
-    lockstep.inject(loss, seed=7)
-    lockstep.add(Source())
-    lockstep.run_for(5.0)
-    alone = one.numbers
-    assert alone != two.numbers
-    lockstep.close()
-    with Lockstep() as world:
-        later = world.add(Sink('three')), world.add(Sink('one'))
-        world.inject(faults.Loss('another', node='one'), loss, seed=7)
-        world.add(Source())
-        world.run_for(5.0)
-        assert later[1].numbers == alone
-    with Lockstep() as world:
-        # An equal fault loses others.
-        assert 2 < len(play(world, loss, loss, seconds=5.0, seed=7)) < 20
+def test_a_copy_arrives_before_what_is_published_after_it(lockstep):
+    """Both at one time."""
+    order = []
+    for name in 'ab':
+        lockstep.node.create_subscription(Int64, name, lambda m, name=name: order.append(name), 10)
+    a, b = (lockstep.node.create_publisher(Int64, name, 10) for name in 'ab')
+    lockstep.inject(faults.Duplicate('a', copies=2, node='lockstep'))
+    a.publish(Int64())
+    b.publish(Int64())
+    lockstep.settle()
+    assert order == ['a', 'a', 'a', 'b']
+
+
+def test_raw_subscriptions_and_those_with_info_are_affected(lockstep):
+    raw, infos = [], []
+    node = lockstep.add(Sink())
+    node.create_subscription(Int64, 'count', raw.append, 10, raw=True)
+    node.create_subscription(Int64, 'count', lambda message, info: infos.append((message, info)), 10)
+    lockstep.inject(faults.Duplicate('count'))
+    lockstep.publish('count', Int64(data=5))
+    assert [type(one) for one in raw] == [bytes, bytes]
+    assert [message.data for message, _ in infos] == [5, 5]
+    assert 'source_timestamp' in infos[0][1]
 
 
 def test_latched_messages_pass_the_faults_of_a_later_subscription(lockstep):
@@ -167,35 +150,74 @@ def test_latched_messages_pass_the_faults_of_a_later_subscription(lockstep):
     assert late.received == [(4, 700.0), (5, 700.0), (6, 700.0)]
 
 
-def test_raw_subscriptions_and_those_with_info_are_affected(lockstep):
-    node = lockstep.add(Node('node'))
-    raw, infos = [], []
-    node.create_subscription(Int64, 'count', raw.append, 10, raw=True)
-    node.create_subscription(Int64, 'count', lambda message, info: infos.append((message, info)), 10)
-    lockstep.inject(faults.Duplicate('count'))
-    lockstep.publish('count', Int64(data=5))
-    assert [type(one) for one in raw] == [bytes, bytes]
-    assert [message.data for message, _ in infos] == [5, 5]
-    assert 'source_timestamp' in infos[0][1]
+@pytest.mark.lockstep(args=['--ros-args', '-r', '__ns:=/robot1'])
+def test_names_are_in_the_namespace_of_the_test(lockstep):
+    sink = lockstep.create(Sink)
+    lockstep.create(Source)
+    sink.received.clear()
+    lockstep.inject(faults.Loss('count', node='sink', duration=0.35), faults.Kill('source', start=0.75))
+    lockstep.run_for(1.0)
+    assert sink.numbers == [4, 5, 6, 7]
+    assert lockstep.find('sink') is lockstep.find('/robot1/sink') is sink
 
 
 # --- Events and errors
 
 
+def events(world):
+    return [(event.time_ns / 1e9, event.what) for event in world.fault_events]
+
+
+def test_events_name_what_has_happened_to_which_messages_and_are_recorded(lockstep, recorded_run):
+    play(lockstep, faults.Loss('count', start=0.3, duration=0.3), faults.Stale('count', start=0.65))
+    assert events(lockstep) == [
+        (0.3, 'begins'),
+        (0.6, 'messages 3 to 5 of /count to /sink lost, from 0.3 s to 0.5 s'),
+        (0.6, 'ends: 3 of 3 messages of /count to /sink'),
+        (0.65, 'begins'),
+        (1.0, 'messages 4 to 7 of /count to /sink changed, from 0.7 s to 1 s'),
+    ]
+    recorded_run.finish()
+    with open_bag(recorded_run.bag) as bag:
+        times = {}
+        for connection, time, _ in bag.messages():
+            times.setdefault(connection.topic, []).append(time)
+    # What was published, not what arrived.
+    assert len(times['/count']) == 11
+    assert times['/fault_events'][:3] == [1_300_000_000, 1_600_000_000, 1_600_000_000]
+
+
+def test_a_delay_ends_when_its_last_message_has_arrived(lockstep):
+    delay = faults.Delay('count', 1.0, start=0.25, duration=0.2)
+    got = play(lockstep, delay, seconds=0.6)
+    assert got == in_time(1, 2)
+    report = lockstep.report()
+    assert f'{delay!r}: over, its last message arrives at 1.4 s, 2 of 2 messages' in report
+    lockstep.run_for(1.4)
+    # The two that were delayed, and those that wait behind them.
+    assert got[2:6] == [(3, 1300.0), (4, 1400.0), (5, 1400.0), (6, 1400.0)]
+    total = '2 of 2 messages of /count to /sink and 9 behind them'
+    assert events(lockstep) == [
+        (0.25, 'begins'),
+        (0.45, 'messages 3 to 4 of /count to /sink delayed by 1 s, from 0.3 s to 0.4 s'),
+        (0.45, 'is over, its last message arrives at 1.4 s'),
+        (1.4, 'messages 5 to 13 of /count to /sink delayed by 0.1 s to 0.9 s, from 0.5 s to 1.3 s'),
+        (1.4, f'ends: {total}'),
+    ]
+    assert f'{delay!r}: ended, {total}' in lockstep.report()
+
+
 def test_events_are_published_reported_and_bounded(lockstep):
     loss = faults.Loss('count', probability=0.5, duration=99.0)
-    events = lockstep.listen(String, 'fault_events')
+    published = lockstep.listen(String, 'fault_events')
     play(lockstep, loss, faults.Loss('count', start=500.0), seconds=100.0)
-    texts = [json.loads(message.data) for message in events]
-    assert [(text['time'], text['what']) for text in texts] == [
-        (event.time_ns / 1e9, event.what) for event in lockstep.fault_events
-    ]
+    texts = [json.loads(message.data) for message in published]
+    assert [(text['time'], text['what']) for text in texts] == events(lockstep)
     assert texts[0]['fault'] == repr(loss)
     assert len(texts) == 201
     assert texts[199]['what'].endswith('(further events of this fault are omitted)')
     assert texts[200]['what'].startswith('ends: ')
     report = lockstep.report()
-    assert f'  {loss!r}: ended, {texts[200]["what"][6:]}' in report
     assert 'events of faults, without the first 181:' in report
     assert "Loss('count', start=500.0): has not begun, starts at 500 s" in report
     lockstep.finish()
@@ -210,10 +232,16 @@ def test_a_fault_that_met_nothing_is_an_error(lockstep):
     )
     with pytest.raises(LockstepError, match=expected):
         lockstep.check_faults()
+    # The node and the topic, but not of that node.
     lockstep.add(Sink('snik', topic='cuont'))
-    lockstep.add(Sink('other', topic='snik'))
     with pytest.raises(LockstepError, match=r"effect: Loss\('count', node='snik'\): no subscription"):
         lockstep.finish()
+    nodes = [faults.Kill('a'), faults.Hang('b'), faults.Slow('/c/d', 1.0), faults.TimerJitter('e', 1.0)]
+    lockstep.inject(*nodes, faults.LateService('aks', 1.0))
+    with pytest.raises(LockstepError) as caught:
+        lockstep.check_faults()
+    for name in ('node /a', 'node /b', 'node /c/d', 'node /e', 'service /aks'):
+        assert f'no {name} was seen' in str(caught.value)
     lockstep.close()
 
 
@@ -221,35 +249,12 @@ def test_wrong_arguments_of_inject_are_named(lockstep):
     lockstep.run_for(2.0)
     for fault, seed, words in (
         (faults.Loss, 0, 'inject takes faults, got <class'),
-        (5, 0, 'inject takes faults, got 5'),
         (faults.Loss('count'), '0', "seed must be an integer, got '0'"),
         (faults.Loss('count', duration=1.5), 0, 'is over: 2 s have passed since the start'),
         (faults.Loss('/clock'), 0, 'sets the clocks itself; use TimeJump or ClockPause'),
-        (faults.Kill('lockstep'), 0, r"Kill\('lockstep'\) names the node of the test itself"),
+        (faults.Kill('lockstep'), 0, 'names the node of the test itself'),
     ):
         with pytest.raises(LockstepError, match=words):
             lockstep.inject(fault, seed=seed)
     lockstep.run_for(0.1)
     assert lockstep.fault_events == []
-
-
-def test_a_recording_has_what_was_published_and_what_the_faults_did(lockstep, recorded_run):
-    play(lockstep, faults.Loss('count', start=0.15, duration=0.2), seconds=0.5)
-    recorded_run.finish()
-    with open_bag(recorded_run.bag) as bag:
-        times = {}
-        for connection, time, _ in bag.messages():
-            times.setdefault(connection.topic, []).append(time)
-    assert len(times['/count']) == 6
-    assert times['/fault_events'] == [1_150_000_000, 1_350_000_000, 1_350_000_000]
-
-
-@pytest.mark.lockstep(args=['--ros-args', '-r', '__ns:=/robot1'])
-def test_names_are_in_the_namespace_of_the_test(lockstep):
-    sink = lockstep.create(Sink)
-    lockstep.create(Source)
-    sink.received.clear()
-    lockstep.inject(faults.Loss('count', node='sink', duration=0.35), faults.Kill('source', start=0.75))
-    lockstep.run_for(1.0)
-    assert sink.numbers == [4, 5, 6, 7]
-    assert lockstep.find('sink') is lockstep.find('/robot1/sink') is sink
