@@ -42,10 +42,6 @@ def at_rest(**model):
     return Robot(model=RobotModel(wheel_radius=R, wheel_separation=L, **model), stamp=0, pose=START)
 
 
-def lagging(tau, **model):
-    return at_rest(actuators=Actuators(lag=tau), **model)
-
-
 def reached(tau, seconds):
     """Return the angle of a wheel that approaches 1 rad/s from rest, after a time."""
     return seconds - tau * (1.0 - math.exp(-seconds / tau))
@@ -57,7 +53,7 @@ def close(pose, expected, tolerance=1e-12):
     assert abs(wrap_angle(difference[2])) < tolerance
 
 
-# --- Motors, as values
+# --- The robot as a value
 
 
 def test_a_weak_motor_limits_its_own_wheel_after_the_limits_of_the_robot():
@@ -72,16 +68,12 @@ def test_a_weak_motor_limits_its_own_wheel_after_the_limits_of_the_robot():
 
 
 def test_a_lagging_robot_reaches_the_command_and_is_then_an_ordinary_one():
-    robot = lagging(0.1).commanded((0.2, 1.0), 0)
+    robot = at_rest(actuators=Actuators(lag=0.1)).commanded((0.2, 1.0), 0)
     assert robot.settles_at == round(SETTLING * 0.1 * SECOND)
     assert robot.at(robot.settles_at - 1).twist == pytest.approx((0.2, 1.0), rel=1e-15)
     assert robot.at(robot.settles_at).twist == robot.target == (0.2, 1.0)
-    assert robot.at(robot.stamp + 5 * SECOND).twist == (0.2, 1.0)
     with pytest.raises(ValueError, match='cannot go back'):
         robot.at(SECOND).at(SECOND - 1)
-
-
-# --- Encoders, as values
 
 
 def test_odometry_of_coarse_encoders_stays_within_their_increment_of_the_truth():
@@ -122,28 +114,23 @@ def test_a_slow_wheel_is_seen_as_bursts_of_whole_increments():
     assert encoders.read(robot.at(4 * SECOND).restarted(SECOND)).speeds == (0.0, 0.0)
 
 
-# --- Pushes, as values
-
-
 @pytest.mark.parametrize('noticed', [False, True])
 def test_a_push_is_a_motion_in_the_body_frame(noticed):
+    push = (0.1, -0.05, 0.7)
     robot = at_rest(drift=Drift(left_wheel_radius_multiplier=1.2))
     robot = robot.placed(START, np.diag([1e-4, 2e-4, 3e-4]), 0).commanded((0.2, 0.4), 0)
     before = robot.at(SECOND)
-    after = robot.pushed((0.1, -0.05, 0.7), SECOND, noticed=noticed)
-    close(compose(inverse(before.true_pose), after.true_pose), (0.1, -0.05, 0.7))
-    expected = compose(before.pose, (0.1, -0.05, 0.7)) if noticed else before.pose
-    close(after.pose, expected)
+    after = robot.pushed(push, SECOND, noticed=noticed)
+    close(compose(inverse(before.true_pose), after.true_pose), push)
+    close(after.pose, compose(before.pose, push) if noticed else before.pose)
     assert (after.twist, after.wheel_angles) == (before.twist, before.wheel_angles)
     assert after.covariance_tuple == before.covariance_tuple
     # Who reads the start_pose of a push can compute all that follows from it.
     anew = before.placed(after.pose, after.covariance, SECOND)
     assert (after.moments == anew.moments) == noticed
     # It drives on from there.
-    close(
-        after.at(2 * SECOND).true_pose,
-        compose(after.true_pose, compose(inverse(before.true_pose), before.at(2 * SECOND).true_pose)),
-    )
+    driven = compose(inverse(before.true_pose), before.at(2 * SECOND).true_pose)
+    close(after.at(2 * SECOND).true_pose, compose(after.true_pose, driven))
 
 
 def test_a_push_that_the_odometry_does_not_notice_needs_a_truth():
@@ -151,7 +138,7 @@ def test_a_push_that_the_odometry_does_not_notice_needs_a_truth():
         at_rest().pushed((0.1, 0.0, 0.0), 0)
 
 
-# --- In a world
+# --- The robot in a world
 
 
 def drive(world, v=0.2, omega=0.0, topic='cmd_vel'):
@@ -177,7 +164,6 @@ def test_a_motor_dies_under_a_command_that_is_held_and_lives_again(lockstep, rob
     close(pose_of(topics.odom[-1]), expected, 1e-9)
     close(robot.truth, expected, 1e-9)
     assert topics.states[-1].position.tolist() == pytest.approx([0.2 / R, 0.2 / R * 1.5])
-    assert [event.what for event in lockstep.fault_events] == ['begins', 'ends']
 
 
 def test_a_lagging_robot_is_seen_in_its_odometry_and_commands(lockstep, robot_at):
@@ -198,7 +184,7 @@ def test_a_lagging_robot_is_seen_in_its_odometry_and_commands(lockstep, robot_at
     assert np.diff(instants(topics.applied))[-1] == SECOND // 2
 
 
-def test_coarse_encoders_in_a_world(lockstep, robot_at):
+def test_coarse_encoders_are_seen_by_the_odometry_alone_and_for_a_time(lockstep, robot_at):
     robot = robot_at(cmd_vel_timeout=0.0)
     topics = Topics(lockstep)
     truths = lockstep.listen(Odometry, 'ground_truth')
@@ -221,7 +207,6 @@ def test_coarse_encoders_in_a_world(lockstep, robot_at):
     # Afterwards the odometry goes on from where it was.
     jumps = np.diff([pose_of(one)[:2] for one in topics.odom], axis=0)
     assert np.hypot(*jumps.T).max() < R * increment + 0.2 / 50.0
-    assert len(topics.starts) == 1
 
 
 def test_coarse_odometry_can_be_reset(lockstep, robot_at):
@@ -230,13 +215,12 @@ def test_coarse_odometry_can_be_reset(lockstep, robot_at):
     lockstep.inject(EncoderSteps(16))
     drive(lockstep)
     lockstep.run_for(0.3)
-    lockstep.call(Trigger, 'reset_odometry')
-    lockstep.run_for(0.002)
     assert pose_of(topics.odom[-1])[0] > 0.52
     drive(lockstep, 0.0)
+    lockstep.call(Trigger, 'reset_odometry')
     lockstep.run_for(0.1)
     close(pose_of(topics.odom[-1]), (0.5, 0.0, 0.0))
-    close(robot.truth, (0.5604, 0.0, 0.0), 1e-9)
+    close(robot.truth, (0.56, 0.0, 0.0), 1e-9)
 
 
 @pytest.mark.parametrize('noticed', [False, True])
@@ -256,23 +240,14 @@ def test_a_push_moves_the_robot_and_its_odometry_only_if_it_is_noticed(lockstep,
     close(pose_of(topics.odom[-1]), moved if noticed else (1.0, 0.0, math.pi / 2.0))
     assert (len(starts), bool(truths)) == (noticed, not noticed)
     close(pose_of((starts or truths)[-1]), moved)
-    # A reset is one of the odometry alone.
-    lockstep.call(Trigger, 'reset_odometry')
-    drive(lockstep)
-    lockstep.run_for(0.1)
-    if not noticed:
-        close(robot.truth, compose(moved, (0.02, 0.0, 0.0)), 1e-9)
-        close(pose_of(topics.odom[-1]), (1.0, 0.02, math.pi / 2.0), 1e-9)
 
 
-def test_slip_and_wrong_geometry_for_a_time_are_seen_by_the_truth_alone(lockstep, robot_at):
+def test_wrong_geometry_for_a_time_is_seen_by_the_truth_alone(lockstep, robot_at):
     robot = robot_at(cmd_vel_timeout=0.0)
     topics = Topics(lockstep)
     lockstep.inject(WrongGeometry(left_wheel_radius_multiplier=0.5, start=0.5, duration=0.5))
     drive(lockstep)
-    lockstep.run_for(0.4)
-    close(robot.truth, (0.08, 0.0, 0.0), 1e-9)
-    lockstep.run_for(1.0)
+    lockstep.run_for(1.4)
     # Half a second with 0.2 m/s at the right and 0.1 m/s at the left wheel.
     expected = integrate(integrate((0.1, 0.0, 0.0), (0.15, 0.1 / L), 0.5), (0.2, 0.0), 0.4)
     close(robot.truth, expected, 1e-9)
@@ -294,7 +269,7 @@ def test_the_slip_follows_from_the_seed_of_the_injection(lockstep, robot_at):
         close(robot.truth, compose(before, (0.02, 0.0, 0.0)), 1e-9)
 
 
-def test_faults_add_up_and_parameters_still_change(lockstep, robot_at):
+def test_the_weakest_motor_counts_and_parameters_still_change(lockstep, robot_at):
     robot = robot_at(cmd_vel_timeout=0.0)
     topics = Topics(lockstep)
     lockstep.inject(
@@ -309,12 +284,11 @@ def test_faults_add_up_and_parameters_still_change(lockstep, robot_at):
         lockstep.run_for(0.3)
         seen.append(body_to_wheel(*measured(topics), R, L))
     full = 0.1 / R
-    assert np.array(seen) == pytest.approx(
-        np.array([(full, 2.0), (full, 2.0), (0.0, 2.0), (0.0, 2.5)]), abs=1e-9
-    )
+    expected = np.array([(full, 2.0), (full, 2.0), (0.0, 2.0), (0.0, 2.5)])
+    assert np.array(seen) == pytest.approx(expected, abs=1e-9)
 
 
-def test_lags_count_once_and_multipliers_multiply(lockstep, robot_at):
+def test_the_longest_lag_counts_and_multipliers_multiply(lockstep, robot_at):
     robot = robot_at(true_wheel_separation_multiplier=3.0)
     topics = Topics(lockstep)
     half = WrongGeometry(wheel_separation_multiplier=0.5)
