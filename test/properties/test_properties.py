@@ -1,4 +1,4 @@
-"""Requiring properties of a run, and the limits of speed and acceleration."""
+"""Requiring properties of a run, and properties as values."""
 
 from __future__ import annotations
 
@@ -32,6 +32,8 @@ from diffdrive_jacobian.properties import (
 )
 from diffdrive_jacobian.testing import LockstepError, PropertyViolation
 
+SLOW, FAST = NeverFasterThan(0.5, 2.0), NeverFasterThan(1.0, 2.0)
+
 
 @pytest.fixture
 def send(lockstep):
@@ -42,7 +44,7 @@ def send(lockstep):
 
 
 def test_a_violation_names_property_time_value_limit_and_what_was_before(lockstep, send):
-    lockstep.require(NeverFasterThan(0.5, 2.0))
+    lockstep.require(SLOW)
     send(twist(0.25))
     lockstep.run_for(1.0)
     send(twist(0.75, -1.0))
@@ -55,14 +57,14 @@ def test_a_violation_names_property_time_value_limit_and_what_was_before(lockste
         '  0 s: /cmd_vel: v 0.25 m/s, omega 0 rad/s'
     )
     assert 'last messages, at 2 s of the clock, 1 s after the start:' in str(violation)
-    assert (violation.property, violation.seconds) == (NeverFasterThan(0.5, 2.0), 1.0)
+    assert (violation.property, violation.seconds) == (SLOW, 1.0)
     assert isinstance(violation, LockstepError)
     again = pickle.loads(pickle.dumps(violation))
     assert (str(again), again.property) == (str(violation), violation.property)
 
 
 def test_a_violation_is_raised_once_and_the_other_properties_stay(lockstep, send):
-    lockstep.require(NeverFasterThan(0.5, 2.0), NeverFasterThan(1.0, 2.0))
+    lockstep.require(SLOW, FAST)
     send(twist(0.75))
     with pytest.raises(PropertyViolation, match=r'^NeverFasterThan\(0.5, 2.0\)'):
         lockstep.settle()
@@ -75,15 +77,14 @@ def test_a_violation_is_raised_once_and_the_other_properties_stay(lockstep, send
 
 def test_a_violation_is_seen_in_every_way_of_advancing_time(lockstep, send):
     lockstep.node.create_timer(0.1, lambda: send(twist(1.0)))
-    advances = (
+    for advance in (
         lockstep.step,
         lambda: lockstep.run_until(lambda: False, 1.0),
         lambda: lockstep.run_for(0.1),
         lambda: lockstep.jump(5.0),
         lambda: lockstep.jump(-2.0) or lockstep.step(),
-    )
-    for advance in advances:
-        lockstep.require(NeverFasterThan(0.5, 2.0))
+    ):
+        lockstep.require(SLOW)
         with pytest.raises(PropertyViolation):
             advance()
 
@@ -107,6 +108,12 @@ def test_a_topic_that_nobody_could_publish_on_is_an_error_at_the_end(lockstep, s
     assert not isinstance(raised.value, PropertyViolation)
 
 
+def test_a_topic_of_another_type_is_an_error(lockstep, robot_at):
+    lockstep.require(NeverFasterThan(0.5, 2.0, topic='joint_states'))
+    with pytest.raises(LockstepError, match=r'geometry_msgs/msg/Twist, .* sensor_msgs/msg/JointState'):
+        robot_at()
+
+
 def test_nothing_that_a_node_can_notice_is_changed(lockstep):
     def graph():
         count = lockstep.node.count_subscribers
@@ -118,6 +125,44 @@ def test_nothing_that_a_node_can_notice_is_changed(lockstep):
     with pytest.raises(LockstepError, match='which no node has a publisher'):
         lockstep.finish()
 
+
+def test_the_speed_of_odometry_in_a_namespace(lockstep, robot_at):
+    lockstep.require(NeverFasterThan(0.25, 1.0, topic='odom', namespace='/one'))
+    robot_at(namespace='/one')
+    lockstep.publish('/one/cmd_vel', twist(0.25))
+    lockstep.run_for(0.1)
+    lockstep.publish('/one/cmd_vel', twist(0.3))
+    with pytest.raises(PropertyViolation) as raised:
+        lockstep.run_for(1.0)
+    assert raised.value.text.startswith('/one/odom: v 0.3 m/s')
+
+
+def test_a_long_property_does_not_hide_what_is_wrong(lockstep, send):
+    """Its message is short. Its `repr` is complete."""
+    near = StaysNear([(0.1 * number, 0.0) for number in range(61)], 0.1, odom='pose')
+    assert eval(repr(near)) == near
+    shown = "StaysNear(((0.0, 0.0), (0.1, 0.0), ... 61 in all), 0.1, odom='pose')"
+    assert str(near) == shown
+    lockstep.require(near)
+    with pytest.raises(LockstepError, match=re.escape(f'{shown} observes /pose, which no node')):
+        lockstep.finish()
+    lockstep.require(near)
+    send(odometry_at(0.0, 1.0), 'pose')
+    with pytest.raises(PropertyViolation) as caught:
+        lockstep.settle()
+    assert str(caught.value).startswith(f'{shown} is violated at 0 s: /pose: ')
+
+
+def test_bytes_that_are_no_message_violate_a_property_of_the_robot(lockstep):
+    publisher = lockstep.node.create_publisher(Odometry, 'odom', 10)
+    for required in (PoseFinite(), NeverFasterThan(1.0, 1.0, topic='odom')):
+        lockstep.require(required)
+        publisher.publish(b'\0')
+        with pytest.raises(PropertyViolation, match='/odom: bytes that are no Odometry'):
+            lockstep.settle()
+
+
+# --- As values
 
 VALUES = [
     (NeverFasterThan(0.5, 2.0), 'NeverFasterThan(0.5, 2.0)'),
@@ -144,93 +189,51 @@ VALUES = [
 ]
 
 
-def test_every_property_is_among_the_values():
-    public = (getattr(properties, name) for name in properties.__all__)
-    kinds = {one for one in public if isinstance(one, type) and issubclass(one, properties.Property)}
+def test_properties_are_values_whose_expressions_make_them_again():
+    public = {name: getattr(properties, name) for name in properties.__all__}
+    for one, expression in VALUES:
+        assert repr(one) == expression
+        assert eval(expression, public) == one == pickle.loads(pickle.dumps(one))
+    kinds = {
+        one for one in public.values() if isinstance(one, type) and issubclass(one, properties.Property)
+    }
     assert {type(one) for one, _ in VALUES} == kinds - {properties.Property}
 
 
-def test_properties_are_values():
-    for one, expression in VALUES:
-        assert repr(one) == expression
-        assert eval(expression, {name: getattr(properties, name) for name in properties.__all__}) == one
-        assert pickle.loads(pickle.dumps(one)) == one
+NAN, INF = float('nan'), float('inf')
 
 
-def test_invalid_fields_are_refused():
-    for create, words in (
-        (lambda: NeverFasterThan(-1.0, 2.0), 'v must be zero or positive, got -1.0'),
-        (lambda: NeverFasterThan('1', 2.0), "v must be a number, got '1'"),
-        (lambda: NeverFasterThan(1.0, 2.0, topic=''), 'topic must be a string that is not empty'),
-        (lambda: StatusProtocol(goals='goal_pose'), 'goals must be a list or tuple of names'),
-        (lambda: StatusProtocol(namespace=1), 'namespace must be a string, got 1'),
-        (
-            lambda: StaysWithin((1, 0), (0, 1)),
-            r'x must be the least and the largest value, got \(1, 0\)',
-        ),
-        (lambda: StaysWithin(1.0, (0, 1)), 'x must be the least and the largest value, got 1.0'),
-        (lambda: StaysNear([1, 2], 0.1), r'path must be a sequence of \(x, y\), got \[1, 2\]'),
-        (lambda: Settles(1.0, 0.0), 'tolerance must be positive, got 0.0'),
-        (lambda: ReachesGoal(float('inf')), 'within must be zero or positive and finite, got inf'),
-    ):
-        with pytest.raises(ValueError, match=words):
-            create()
-
-
-# --- Texts and topics
-
-
-def test_a_long_property_does_not_hide_what_is_wrong(lockstep, send):
-    """Its message is short. Its `repr` is complete."""
-    path = [(0.1 * number, 0.0) for number in range(61)]
-    near = StaysNear(path, 0.1, odom='pose')
-    assert eval(repr(near)) == near
-    shown = "StaysNear(((0.0, 0.0), (0.1, 0.0), ... 61 in all), 0.1, odom='pose')"
-    assert str(near) == shown
-    lockstep.require(near)
-    with pytest.raises(LockstepError, match=re.escape(f'{shown} observes /pose, which no node')):
-        lockstep.finish()
-    lockstep.require(near)
-    send(odometry_at(0.0, 1.0), 'pose')
-    with pytest.raises(PropertyViolation) as caught:
-        lockstep.settle()
-    assert str(caught.value).startswith(f'{shown} is violated at 0 s: /pose: ')
-
-
-def test_the_speed_of_odometry_in_a_namespace_as_messages_and_as_bytes(lockstep, send, robot_at):
-    lockstep.require(NeverFasterThan(0.25, 1.0, topic='odom', namespace='/one'))
-    robot_at(namespace='/one')
-    lockstep.publish('/one/cmd_vel', twist(0.25))
-    lockstep.run_for(0.1)
-    send(Odometry(), '/one/odom')
-    lockstep.publish('/one/cmd_vel', twist(0.3))
-    with pytest.raises(PropertyViolation) as raised:
-        lockstep.run_for(1.0)
-    assert raised.value.text.startswith('/one/odom: v 0.3 m/s')
-
-
-def test_a_topic_of_another_type_is_an_error(lockstep, robot_at):
-    lockstep.require(NeverFasterThan(0.5, 2.0, topic='joint_states'))
-    with pytest.raises(LockstepError, match=r'geometry_msgs/msg/Twist, .* sensor_msgs/msg/JointState'):
-        robot_at()
+@pytest.mark.parametrize(
+    ('kind', 'arguments', 'words'),
+    [
+        (NeverFasterThan, {'v': -1.0, 'omega': 2.0}, 'v must be zero or positive, got -1.0'),
+        (NeverFasterThan, {'v': '1', 'omega': 2.0}, 'v must be a number'),
+        (NeverFasterThan, {'v': 1.0, 'omega': 2.0, 'topic': ''}, 'topic must be a string that is not'),
+        (StatusProtocol, {'goals': 'goal_pose'}, 'goals must be a list or tuple of names'),
+        (StatusProtocol, {'namespace': 1}, 'namespace must be a string'),
+        (StaysWithin, {'x': (1, 0), 'y': (0, 1)}, r'x must be the least and the .*, got \(1, 0\)'),
+        (StaysWithin, {'x': (0, 1), 'y': 1.0}, 'y must be the least and the largest value, got 1.0'),
+        (StaysNear, {'path': [1, 2], 'distance': 0.1}, r'path must be a sequence of \(x, y\)'),
+        (Settles, {'within': 1.0, 'tolerance': 0.0}, 'tolerance must be positive'),
+        (ReachesGoal, {'within': INF}, 'within must be zero or positive and finite'),
+        (FieldWithin, {'topic': 'a', 'field': 'x', 'low': 1, 'high': 0}, 'low must be at most high'),
+        (FieldWithin, {'topic': 'a', 'field': 'x', 'low': NAN, 'high': 0}, 'low must be a number'),
+        (FieldWithin, {'topic': 'a', 'field': 'x', 'low': 'a', 'high': 0}, 'low must be a number'),
+    ],
+)
+def test_invalid_fields_are_refused(kind, arguments, words):
+    with pytest.raises(ValueError, match=f'^{kind.__name__}: {words}'):
+        kind(**arguments)
 
 
 # --- The page
 
 
-def test_the_page_has_a_property_of_one_s_own(lockstep, robot_at):
-    (code,) = (
-        block.code
-        for block in blocks(PAGES['doc/lockstep.md'].read_text())
-        if block.file == 'test_own_property.py'
-    )
+def test_the_page_lists_every_property_and_has_one_of_ones_own(lockstep, robot_at):
+    page = PAGES['doc/lockstep.md'].read_text()
+    base = {'Property', 'PropertyViolation', 'end_of_faults'}
+    assert [one for one in properties.__all__ if one not in base and f'`{one}(' not in page] == []
+    (code,) = (block.code for block in blocks(page) if block.file == 'test_own_property.py')
     names = {}
     exec(code, names)
     names['test_a_robot_publishes_odometry'](lockstep, robot_at)
-
-
-def test_the_page_lists_every_property():
-    table = PAGES['doc/lockstep.md'].read_text()
-    base = {'Property', 'PropertyViolation', 'end_of_faults'}
-    missing = [name for name in properties.__all__ if name not in base and f'`{name}(' not in table]
-    assert missing == []
