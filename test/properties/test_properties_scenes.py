@@ -72,6 +72,11 @@ KEPT = [
             PoseFinite(),
         )
     ),
+    # A path replaces a goal.
+    *(
+        (one, [goal_at(1.0), STRAIGHT, odometry_at(0.5), 1.5])
+        for one in (ReachesGoal(1.0), Settles(1.0, 0.1))
+    ),
     (StatusProtocol(), statuses(ACCEPTED, ACCEPTED, EXECUTING, EXECUTING, ABORTED, (ABORTED, 2))),
     (StatusProtocol(), statuses(ACCEPTED, CANCELED, (ACCEPTED, 2), (EXECUTING, 2), (SUCCEEDED, 2))),
     (StatusProtocol(), statuses(ACCEPTED, EXECUTING, (ABORTED, 2), EXECUTING, SUCCEEDED)),
@@ -108,6 +113,8 @@ VIOLATED = [
     (ReachesGoal(2.0, tolerance=0.03), ARRIVES, 'allowed: within 0.03 m and standing'),
     (ReachesGoal(1.0), [goal_at(1.0), 1.5], 'there was no odometry on /odom'),
     (ReachesGoal(1.0), [odometry_at(1.0, v=0.1), goal_at(1.0), 1.5], r'robot is 0 m .* v 0.1 m/s'),
+    # A path that controllers refuse replaces nothing.
+    (ReachesGoal(1.0), [goal_at(1.0), path((1, 0)), 1.5], 'there was no odometry on /odom'),
     # It creeps.
     (ReachesGoal(1.0), [goal_at(1.0), odometry_at(1.0, v=0.02), 1.5], r'robot is 0 m .* v 0.02 m/s'),
     (ReachesGoal(1.0, yaw_tolerance=0.1), [goal_at(1.0), odometry_at(1.0, theta=3.1), 2.0], '3.1 rad'),
