@@ -24,13 +24,8 @@ def answering(world, name):
         world.run_for(0.1)
 
 
-@pytest.mark.parametrize('relation', [Repeated('echo/in'), Late('echo/in', 0.04)])
-def test_a_program_that_does_what_it_must(relation):
-    check_relation(answering, relation, case='echo')
-
-
-def test_a_program_that_counts_is_found():
-    with pytest.raises(
-        PropertyViolation, match=r"Repeated\('ticker/in'\) is violated at 0.05 s: /ticker"
-    ):
+def test_a_program_that_counts_is_found_and_one_that_does_what_it_must_is_not():
+    check_relation(answering, Late('echo/in', 0.04), case='echo')
+    words = r"Repeated\('ticker/in'\) is violated at 0.05 s: /ticker"
+    with pytest.raises(PropertyViolation, match=words):
         check_relation(answering, Repeated('ticker/in'), case='ticker')
