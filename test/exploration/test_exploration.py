@@ -10,21 +10,13 @@ from pathlib import Path
 
 import exploration_scenarios as scenarios
 import pytest
-from exploration_scenarios import (
-    changing,
-    demanding,
-    divide,
-    failing,
-    follow,
-    identified,
-    nothing,
-    serial,
-)
+from exploration_scenarios import changing, divide, failing, follow, identified, nothing, serial
 from hypothesis import strategies as st
 from support import inner_sessions  # noqa: F401  What it imports is not imported again.
 
 from diffdrive_jacobian.faults import Hang, Loss
 from diffdrive_jacobian.properties import NeverFasterThan
+from diffdrive_jacobian.relations import Repeated
 from diffdrive_jacobian.testing import (
     ExplorationError,
     Replay,
@@ -108,6 +100,7 @@ def test_the_written_test_reproduces_it_until_the_controller_is_mended(found, py
 
 
 def test_each_property_and_each_exception_is_a_finding(tmp_path):
+    """Also a property that the scenario requires."""
     found = serial(divide, [NeverFasterThan(0.15, 1.0)], cases=SPEEDS, worlds=10, output=tmp_path)
     cases = {one.directory.name: one.trial.case['speed'] for one in found.findings}
     assert cases == {
@@ -120,12 +113,8 @@ def test_each_property_and_each_exception_is_a_finding(tmp_path):
     assert crash.violation.text.startswith('Traceback')
     assert 'ZeroDivisionError' in str(crash)
     assert crash.deterministic
-
-
-def test_a_property_that_the_scenario_requires_is_a_finding():
-    (finding,) = serial(demanding, worlds=1).findings
+    (finding,) = serial(scenarios.demanding, worlds=1).findings
     assert finding.violation.key == repr(NeverFasterThan(0.1, 1.0))
-    assert finding.deterministic
 
 
 def test_a_scenario_that_is_not_deterministic_is_reported():
@@ -167,6 +156,11 @@ def test_fewer_worlds_than_asked_for_are_explained(scenario, arguments, stopped)
     assert found.stopped == stopped
     assert f'stopped: {stopped}' in str(found)
     assert len(found.findings) == (scenario is failing)
+
+
+def test_a_limit_of_shrinking_is_reported():
+    (finding,) = serial(failing, cases=st.integers(0, 1000), worlds=5, shrink_worlds=1).findings
+    assert (finding.shrink_worlds, finding.complete) == (1, False)
 
 
 class Broken(SerialExecutor):
@@ -216,34 +210,32 @@ def test_an_executor_that_fails_once_is_reported(number):
         serial(failing, executor=executor, cases=st.integers(0, 10**6), worlds=21)
 
 
-def test_a_limit_of_shrinking_is_reported():
-    (finding,) = serial(failing, cases=st.integers(0, 1000), worlds=5, shrink_worlds=1).findings
-    assert (finding.shrink_worlds, finding.complete) == (1, False)
-
-
-MISTAKES = [
-    ({'scenario': lambda world, case: None}, 'top level'),
-    ({'properties': SLOW}, 'properties must be a list'),
-    ({'properties': [NeverFasterThan]}, r'create one: NeverFasterThan\(...\)'),
-    ({'properties': None}, 'properties must be a list, got None'),
-    ({'properties': ['fast']}, "instances of Property, got 'fast'"),
-    ({'properties': [SLOW, SLOW]}, 'given once'),
-    ({'properties': [NeverFasterThan(1.0, 1.0, topic='typo')]}, 'without faults: .*typo'),
-    ({'faults': st.just(Loss('odom'))}, r"lists of faults; it gave Loss\('odom'\)"),
-    ({'faults': [Loss('odom')]}, 'faults must be a strategy'),
-    ({'cases': {'x': 3}}, 'cases must be strategies'),
-    ({'cases': st.builds(object)}, 'a case must consist of'),
-    ({'worlds': 0}, 'worlds must be an integer of at least 1, got 0'),
-    ({'seed': -1}, 'seed'),
-    ({'shrink_worlds': 1.5}, 'shrink_worlds'),
-    ({'time_limit': 0.0}, 'time_limit must be positive'),
-    ({'executor': 4}, 'executor must be an Executor'),
-    ({'output': Path(__file__)}, 'cannot be created'),
-    ({'args': ['-p', 'x:=1']}, "args must begin with '--ros-args'"),
-]
-
-
-@pytest.mark.parametrize(('arguments', 'words'), MISTAKES)
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        ({'scenario': lambda world, case: None}, 'top level'),
+        ({'properties': SLOW}, r'properties must be a list: \[NeverFasterThan'),
+        ({'properties': [NeverFasterThan]}, r'create one: NeverFasterThan\(...\)'),
+        ({'properties': None}, 'properties must be a list, got None'),
+        ({'properties': ['fast']}, "instances of Property, got 'fast'"),
+        ({'properties': [SLOW, SLOW]}, 'properties: each can be given once'),
+        ({'properties': [NeverFasterThan(1.0, 1.0, topic='typo')]}, 'without faults: .*typo'),
+        ({'relations': Repeated('x')}, 'relations must be a list'),
+        ({'relations': [SLOW]}, 'relations must be instances of Relation, got NeverFasterThan'),
+        ({'relations': [Repeated('typo')]}, 'without faults: .*no node has the topic /typo'),
+        ({'faults': st.just(Loss('odom'))}, r"lists of faults; it gave Loss\('odom'\)"),
+        ({'faults': [Loss('odom')]}, 'faults must be a strategy'),
+        ({'cases': {'x': 3}}, 'cases must be strategies'),
+        ({'cases': st.builds(object)}, 'a case must consist of'),
+        ({'worlds': 0}, 'worlds must be an integer of at least 1, got 0'),
+        ({'seed': -1}, 'seed'),
+        ({'shrink_worlds': 1.5}, 'shrink_worlds'),
+        ({'time_limit': 0.0}, 'time_limit must be positive'),
+        ({'executor': 4}, 'executor must be an Executor'),
+        ({'output': Path(__file__)}, 'cannot be created'),
+        ({'args': ['-p', 'x:=1']}, "args must begin with '--ros-args'"),
+    ],
+)
 def test_mistakes_are_named(arguments, words):
     with pytest.raises(ExplorationError, match=words):
         serial(**{'scenario': nothing, 'worlds': 1, **arguments})

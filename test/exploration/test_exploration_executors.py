@@ -9,7 +9,7 @@ import random
 import signal
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from threading import Thread
@@ -21,18 +21,18 @@ from hypothesis import strategies as st
 
 from diffdrive_jacobian import signals
 from diffdrive_jacobian.control import find_controller
-from diffdrive_jacobian.exploration.processes import call_in_child
+from diffdrive_jacobian.exploration.exploring import result_of
+from diffdrive_jacobian.exploration.processes import _picklable, call_in_child
 from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.properties import NeverFasterThan
 from diffdrive_jacobian.simulation import SweepSetup, sweep
-from diffdrive_jacobian.testing import LocalExecutor, explore, fault_schedules
+from diffdrive_jacobian.testing import ExplorationError, LocalExecutor, explore, fault_schedules
 
 pytestmark = pytest.mark.process
-LOSSES = fault_schedules(['speed'], kinds=[Loss], duration=1.2)
 FOLLOW = {
     'scenario': follow,
     'properties': [NeverFasterThan(0.35, 1.0)],
-    'faults': LOSSES,
+    'faults': fault_schedules(['speed'], kinds=[Loss], duration=1.2),
     'worlds': 7,
     'shrink_worlds': 0,
 }
@@ -108,6 +108,9 @@ def test_random_numbers_of_other_threads_do_not_end_the_generation_of_worlds():
     assert serial(nothing, cases=cases, worlds=1).worlds == 1
 
 
+# --- Processes
+
+
 def test_a_process_that_dies_is_a_finding(local, tmp_path):
     died = explore(deadly, cases=SPEEDS, worlds=3, executor=local, shrink_worlds=0, output=tmp_path)
     (finding,) = died.findings
@@ -118,6 +121,31 @@ def test_a_process_that_dies_is_a_finding(local, tmp_path):
     assert (finding.directory / 'counterexample.json').exists()
     # Not in this process.
     assert died.replay().same_verdict
+
+
+def test_a_scenario_reads_no_input_and_depends_on_no_earlier_world(local):
+    found = explore(crowded, cases=SPEEDS, worlds=3, executor=local, shrink_worlds=0)
+    (finding,) = found.findings
+    assert 'not the first' in finding.violation.text
+    assert not finding.deterministic
+
+
+def test_an_exception_in_the_process_of_a_thread_is_raised(local):
+    with pytest.raises(ValueError, match='invalid literal'):
+        local.submit(call_in_child, int, 'x').result()
+    assert local.submit(call_in_child, int, '7').result() == 7
+
+
+def test_an_error_of_a_process_that_cannot_be_pickled_or_described_is_reported():
+    class LocalError(Exception):
+        def __str__(self):
+            raise ValueError('of a bug')
+
+    for error in (_picklable(LocalError()), LocalError()):
+        future = Future()
+        future.set_exception(error)
+        with pytest.raises(ExplorationError, match=r'could not be run: .*LocalError: '):
+            result_of(future, None)
 
 
 class PressedTwice(LocalExecutor):
@@ -167,17 +195,7 @@ def test_a_process_ends_with_a_program_that_is_killed():
             raise
 
 
-def test_a_scenario_reads_no_input_and_depends_on_no_earlier_world(local):
-    found = explore(crowded, cases=SPEEDS, worlds=3, executor=local, shrink_worlds=0)
-    (finding,) = found.findings
-    assert 'not the first' in finding.violation.text
-    assert not finding.deterministic
-
-
-def test_an_exception_in_the_process_of_a_thread_is_raised(local):
-    with pytest.raises(ValueError, match='invalid literal'):
-        local.submit(call_in_child, int, 'x').result()
-    assert local.submit(call_in_child, int, '7').result() == 7
+# --- Sweeps
 
 
 def test_a_sweep_reports_progress_and_mistakes():

@@ -5,19 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import exploration_scenarios as scenarios
-import pytest
-from defective_controllers import ARRIVING, RELATIONS, drive
-from exploration_scenarios import Follower, Sensor, failing, follow, serial
+from exploration_scenarios import Follower, Sensor, follow, serial
 from hypothesis import strategies as st
-from related_nodes import LAWS, cases, driven, schedules
-from related_nodes import RELATIONS as OWN
 from support import inner_sessions  # noqa: F401  What it imports is not imported again.
 
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.faults import Hang, Loss, ParameterChange
 from diffdrive_jacobian.properties import FieldWithin, NeverFasterThan
-from diffdrive_jacobian.relations import Mirrored, Moved, Relation, Repeated, check_relation
-from diffdrive_jacobian.testing import ExplorationError, PropertyViolation, fault_schedules, numbers
+from diffdrive_jacobian.relations import Mirrored, Moved, Relation, Repeated
+from diffdrive_jacobian.testing import fault_schedules, numbers
 
 SPEEDS = {'speed': numbers(0.0, 5.0)}
 
@@ -35,13 +31,9 @@ class Doubled(Relation):
 DOUBLED = Doubled(node='follower')
 
 
-def explored(relations, **arguments):
-    """Explore a few worlds of the follower, whose command grows with the age of the speed."""
-    return serial(follow, relations=relations, cases=SPEEDS, worlds=5, **arguments)
-
-
 def test_a_relation_is_found_shrunk_and_replayed():
-    found = explored([DOUBLED, Mirrored(node='follower')])
+    relations = [DOUBLED, Mirrored(node='follower')]
+    found = serial(follow, relations=relations, cases=SPEEDS, worlds=5)
     (finding,) = found.findings
     assert finding.violation.key == "Doubled(node='follower')"
     assert finding.count == 5
@@ -50,15 +42,20 @@ def test_a_relation_is_found_shrunk_and_replayed():
     assert found.compared > 50
     assert found.simulated > 5 * 3 * 1.2
     assert finding.deterministic
-    assert finding.digest
     assert found.replay().same_bits
     assert f'{found.compared} messages compared with images, 1 violated' in str(found)
 
 
 def test_the_written_test_compares_again(tmp_path, pytester):
-    faults = st.just([Loss('speed', start=0.5, duration=0.1)])
-    args = ('--ros-args', '-p', 'rate:=1.0')
-    (finding,) = explored([DOUBLED], faults=faults, args=args, output=tmp_path / 'found').findings
+    (finding,) = serial(
+        follow,
+        relations=[DOUBLED],
+        cases=st.just({'speed': 0.0}),
+        faults=st.just([Loss('speed', start=0.5, duration=0.1)]),
+        args=('--ros-args', '-p', 'rate:=1.0'),
+        worlds=1,
+        output=tmp_path / 'found',
+    ).findings
     source = (finding.directory / 'test_doubled.py').read_text()
     assert "check_relation(follow, Doubled(node='follower'), case=CASE, faults=FAULTS, seed=" in source
     assert f'pause_at={finding.violation.seconds!r}' in source
@@ -71,30 +68,12 @@ def test_the_written_test_compares_again(tmp_path, pytester):
     )
 
 
-@pytest.mark.parametrize(
-    ('relations', 'text'),
-    [
-        (DOUBLED, r'relations must be a list: \[Doubled'),
-        ([Repeated], r'relations must be instances of Relation, got .*create one: Repeated'),
-        ([DOUBLED, DOUBLED], 'relations: each can be given once'),
-        (3, 'relations must be a list, got 3'),
-        ([Repeated('nothing')], 'in a world without faults: .*no node has the topic /nothing'),
-    ],
-)
-def test_relations_are_checked(relations, text):
-    with pytest.raises(ExplorationError, match=text):
-        explored(relations)
-
-
-def test_a_world_that_fails_is_compared_until_then():
-    found = serial(failing, relations=[], cases=st.just(70), worlds=1)
-    assert [one.violation.index for one in found.findings] == [-1]
-    found = serial(scenarios.divide, relations=[Repeated('speed')], cases=SPEEDS, worlds=4)
-    assert {one.violation.index for one in found.findings} <= {-1}
-
-
-def test_a_node_that_fails_at_once_is_a_finding():
-    found = serial(scenarios.refusing, relations=[Repeated('speed')], worlds=1)
+def test_a_world_that_fails_is_compared_until_then_and_is_a_finding_by_its_error():
+    relations = [Repeated('speed')]
+    found = serial(scenarios.divide, relations=relations, cases=SPEEDS, worlds=4)
+    assert {one.violation.index for one in found.findings} == {-1}
+    # Also before there is a node.
+    found = serial(scenarios.refusing, relations=relations, worlds=1)
     assert [one.violation.message for one in found.findings] == ['ValueError: not today']
 
 
@@ -103,68 +82,25 @@ def test_what_was_never_compared_is_noted():
     assert "note: Repeated('speed'): nothing was compared" in str(found)
 
 
-# --- Defective controllers, and right ones
-
-WORLDS = {
-    'wraps angles below -pi only': ({}, 'Moved'),
-    'uses old odometry': ({}, 'Repeated'),
-    'time in single precision': ({}, 'Shifted'),
-    'absolute names': ({}, 'Renamed'),
-    'no defect': ({}, None),
-}
-QUIET = ('--ros-args', '--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
-
-
-@pytest.mark.parametrize('name', WORLDS)
-def test_each_defect_that_no_property_shows_is_found(name):
-    assert {*WORLDS} == {*ARRIVING, 'no defect'}
-    case = {
-        'controller': name,
-        'start': (1.0, 0.5, 0.3),
-        'goals': [(0.2, (0.0, 0.0)), (2.0, (-1.0, 0.3))],
-        'cancel': None,
-        'shutdown': None,
-    }
-    found = set()
-    for relation in RELATIONS:
-        try:
-            check_relation(drive, relation, case=case, args=QUIET)
-        except PropertyViolation as violation:
-            found.add(type(violation.property).__name__)
-    assert WORLDS[name][1] is None or WORLDS[name][1] in found
-    assert bool(found) == (name in ARRIVING)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('law', [None, *LAWS])
-def test_nothing_is_found_in_our_own_controller(law):
-    found = serial(driven, relations=OWN, cases=cases(law), faults=schedules(), worlds=2)
-    assert not found.findings, str(found)
-    assert found.compared > 500
-
-
 # --- What no world has touched
 
 
-def test_what_no_world_has_touched():
+def test_nodes_without_faults_and_topics_that_nothing_checked_are_named():
     faults = st.sampled_from([[Loss('speed', duration=0.5)], [Hang('follower', duration=0.5)], []])
-    found = serial(
-        follow,
-        [NeverFasterThan(90.0, 90.0)],
-        cases=SPEEDS,
-        faults=faults,
-        worlds=10,
-    )
+    required = [NeverFasterThan(90.0, 90.0)]
+    found = serial(follow, required, cases=SPEEDS, faults=faults, worlds=10)
     unseen = found.unseen
-    assert unseen.nodes == ('/sensor',)
-    assert unseen.topics == ()
-    assert unseen.silent == ()
+    assert (unseen.nodes, unseen.topics, unseen.silent) == (('/sensor',), (), ())
     assert unseen.unchecked == ('/speed',)
     assert 'topics that nothing checked: /speed' in str(found)
     compared = serial(follow, relations=[Repeated('speed')], cases=SPEEDS, worlds=2).unseen
     assert compared.unchecked == ('/speed',)
     # Nothing was affected without faults: that is known.
     assert (compared.nodes, compared.topics) == ((), ())
+    # A relation runs without the faults that disturb it.
+    lost = fault_schedules(topics=['speed'], kinds=[Loss], max_faults=1, duration=1.0)
+    found = serial(follow, relations=[Moved()], cases=SPEEDS, faults=lost, worlds=2)
+    assert '  nodes that no fault affected: /follower, /sensor\n' in str(found)
 
 
 def with_parameters(world, case):
@@ -177,22 +113,14 @@ def with_parameters(world, case):
     world.run_for(0.3)
 
 
-def test_parameters_with_one_value_are_named():
+def test_parameters_with_one_value_and_topics_without_messages_are_named():
     change = [ParameterChange('follower', 'changed', 2.0, start=0.1)]
     faults = st.sampled_from([change, []])
     unseen = serial(with_parameters, cases=st.integers(1, 9), faults=faults, worlds=8).unseen
     assert unseen.parameters == (('/sensor', 'same'),)
     assert unseen.silent == ('/unheard',)
     assert unseen.topics == ('/speed', '/unheard')
-    one = serial(
-        with_parameters, [FieldWithin('speed', 'x', 0.0, 9.0)], cases=st.just(1), worlds=1
-    ).unseen
-    assert one.parameters == ()
-    assert one.unchecked == ('/cmd_vel',)
-
-
-def test_a_schedule_without_the_topic_is_seen():
-    faults = fault_schedules(topics=['speed'], kinds=[Loss], max_faults=1, duration=1.0)
-    found = serial(follow, relations=[Moved()], cases=SPEEDS, faults=faults, worlds=10)
-    assert found.unseen.nodes == ('/follower', '/sensor')
-    assert '  nodes that no fault affected: /follower, /sensor\n' in str(found)
+    required = [FieldWithin('speed', 'x', 0.0, 9.0)]
+    # After one world all parameters have one value.
+    one = serial(with_parameters, required, cases=st.just(1), worlds=1).unseen
+    assert (one.parameters, one.unchecked) == ((), ('/cmd_vel',))
