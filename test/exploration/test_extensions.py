@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from textwrap import dedent
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 
 import pytest
 from hypothesis import find
@@ -12,67 +12,60 @@ from rclpy.node import Node
 
 from diffdrive_jacobian.exploration import extensions
 from diffdrive_jacobian.exploration.scenario import ExplorationError
-from diffdrive_jacobian.faults import DeadWheel, Hang
+from diffdrive_jacobian.faults import DeadWheel, Fault, Hang
 from diffdrive_jacobian.testing import RecordedRun, fault_schedules
 
-ARM = """
-    from dataclasses import dataclass, field
-    from hypothesis import strategies as st
-    from diffdrive_jacobian.faults import Fault
 
-    @dataclass(frozen=True, repr=False)
-    class JointStuck(Fault):
-        joint: int
-        arm: str = field(default='arm', kw_only=True)
+@dataclass(frozen=True, repr=False)
+class JointStuck(Fault):
+    """A fault of an arm."""
 
-        def install(self, injection):
-            injection.during(lambda: None)
+    joint: int
+    arm: str = field(default='arm', kw_only=True)
 
-    KINDS = {JointStuck: lambda: {'joint': st.integers(0, 2)}}
+    def install(self, injection):
+        injection.during(lambda: None)
 
-    EMPTY = None
-    WRONG = {int: dict}
 
-    def fail(*_):
-        raise ValueError('no arm')
+KINDS = {JointStuck: lambda: {'joint': st.integers(0, 2)}}
+EMPTY, WRONG = None, {int: dict}
 
-    def draw(bag, picture, marks):
-        if 'arm' not in bag.name:
-            return None
-        if 'broken' in bag.name:
-            return 'it is broken'
-        picture.write_text(str(marks))
-        return ''
-"""
+
+def draw(bag, picture, marks):
+    """Draw a bag of an arm."""
+    if 'arm' not in bag.name:
+        return None
+    if 'broken' in bag.name:
+        return 'it is broken'
+    picture.write_text(str(marks))
+    return ''
+
+
+def fail(*_):
+    raise ValueError('no arm')
 
 
 @pytest.fixture
-def distribution(tmp_path, monkeypatch):
-    """Return a function that installs a distribution with a module `arm_testing` and entry points."""
+def install(monkeypatch):
+    """Return a function that installs a distribution with entry points of a group."""
 
-    def install(name='arm', **entry_points):
-        root = tmp_path / name
-        info = root / f'{name}-1.0.dist-info'
-        info.mkdir(parents=True)
-        (root / 'arm_testing.py').write_text(dedent(ARM))
-        (info / 'METADATA').write_text(f'Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n')
-        lines = [
-            f'[diffdrive_jacobian.{group}]\n{line}\n'
-            for group, lines in entry_points.items()
-            for line in lines
-        ]
-        (info / 'entry_points.txt').write_text('\n'.join(lines))
-        monkeypatch.syspath_prepend(root)
+    def install(group, *lines):
+        pairs = [line.split(' = ') for line in lines]
+        ours = [EntryPoint(name, value, f'diffdrive_jacobian.{group}') for name, value in pairs]
 
-    yield install
-    sys.modules.pop('arm_testing', None)
+        def both(**wanted):
+            return [*entry_points(**wanted), *EntryPoints(ours).select(**wanted)]
+
+        monkeypatch.setattr(extensions, 'entry_points', both)
+
+    return install
 
 
 # --- Kinds of faults
 
 
-def test_another_distribution_has_kinds_of_faults_of_its_own(distribution):
-    distribution(fault_kinds=['arm = arm_testing:KINDS'])
+def test_another_distribution_has_kinds_of_faults_of_its_own(install):
+    install('fault_kinds', 'arm = test_extensions:KINDS')
     strategy = fault_schedules(arms=['left', 'right'], nodes=['driver'], duration=2.0)
     (stuck,) = find(strategy, lambda faults: any(hasattr(one, 'joint') for one in faults))
     assert repr(stuck) == "JointStuck(0, duration=0.1, arm='left')"
@@ -98,16 +91,20 @@ def test_names_that_no_distribution_has_faults_for_are_refused():
 @pytest.mark.parametrize(
     ('value', 'words'),
     [
-        ('arm_testing:JointStuck', r'arm of .*fault_kinds must be a dict of classes of faults'),
-        ('arm_testing:EMPTY', r'must be a dict of classes'),
-        ('arm_testing:WRONG', r'must be a dict of classes'),
-        ('arm_testing:NOTHING', r'arm = arm_testing:NOTHING of .*fault_kinds cannot be imported'),
+        ('test_extensions:JointStuck', r'arm of .*fault_kinds must be a dict of classes of faults'),
+        ('test_extensions:EMPTY', r'must be a dict of classes'),
+        ('test_extensions:WRONG', r'must be a dict of classes'),
+        (
+            'test_extensions:NOTHING',
+            r'arm = test_extensions:NOTHING of .*fault_kinds cannot be imported',
+        ),
         ('arm_ends', r'arm = arm_ends of .* cannot be imported: SystemExit: 3'),
     ],
 )
-def test_kinds_of_faults_that_are_none_are_named(distribution, tmp_path, value, words):
-    distribution(fault_kinds=[f'arm = {value}'])
-    (tmp_path / 'arm' / 'arm_ends.py').write_text('raise SystemExit(3)')
+def test_kinds_of_faults_that_are_none_are_named(install, tmp_path, monkeypatch, value, words):
+    install('fault_kinds', f'arm = {value}')
+    (tmp_path / 'arm_ends.py').write_text('raise SystemExit(3)')
+    monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ExplorationError, match=words):
         fault_schedules(arms=['arm'])
     # Another error is not hidden by that.
@@ -115,10 +112,9 @@ def test_kinds_of_faults_that_are_none_are_named(distribution, tmp_path, value, 
         fault_schedules(nodes=['driver'], kinds=[DeadWheel])
 
 
-def test_two_entry_points_of_one_name_are_refused(distribution):
-    distribution(fault_kinds=['arm = arm_testing:KINDS'])
-    distribution('other', fault_kinds=['arm = other:KINDS'])
-    words = 'several distributions have an entry point arm of .*: arm_testing:KINDS, other:KINDS'
+def test_two_entry_points_of_one_name_are_refused(install):
+    install('fault_kinds', 'arm = test_extensions:KINDS', 'arm = other:KINDS')
+    words = 'several distributions have an entry point arm of .*: other:KINDS, test_extensions:KINDS'
     with pytest.raises(ExplorationError, match=words):
         fault_schedules(arms=['arm'])
 
@@ -126,8 +122,8 @@ def test_two_entry_points_of_one_name_are_refused(distribution):
 # --- Pictures
 
 
-def test_a_bag_is_drawn_by_whoever_knows_it(distribution, tmp_path):
-    distribution(pictures=['arm = arm_testing:draw', 'leg = no_such_module:draw'])
+def test_a_bag_is_drawn_by_whoever_knows_it(install, tmp_path):
+    install('pictures', 'arm = test_extensions:draw', 'leg = no_such_module:draw')
     picture = tmp_path / 'picture'
     assert extensions.draw(tmp_path / 'bag_of_arm', picture, [(1, 'violated')]) == ''
     assert picture.read_text() == "[(1, 'violated')]"
@@ -138,8 +134,8 @@ def test_a_bag_is_drawn_by_whoever_knows_it(distribution, tmp_path):
     assert 'leg = no_such_module:draw of diffdrive_jacobian.pictures cannot be imported' in why
 
 
-def test_a_picture_that_fails_loses_no_bag_and_hides_no_other(distribution, tmp_path, lockstep):
-    distribution(pictures=['arm = arm_testing:fail', 'leg = arm_testing:fail'])
+def test_a_picture_that_fails_loses_no_bag_and_hides_no_other(install, tmp_path, lockstep):
+    install('pictures', 'arm = test_extensions:fail', 'leg = test_extensions:fail')
     lockstep.create(lambda: Node('arm'))
     run = RecordedRun(lockstep, tmp_path / 'kept')
     kept = run.keep()
