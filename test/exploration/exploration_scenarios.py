@@ -151,8 +151,3 @@ def mute(world, case):
     listener = world.create(lambda: Node('listener', start_parameter_services=False))
     listener.create_subscription(Vector3, 'speed', lambda _: None, 10)
     world.run_for(0.3)
-
-
-def refusing(world, case):
-    """Fail before there is a node."""
-    raise ValueError('not today')

@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 import math
+from unittest.mock import Mock
 
 import numpy as np
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from hypothesis import strategies as st
-from nav_msgs.msg import Goals
+from nav_msgs.msg import Goals, Path
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import make, make_complete
 from support.ros_messages import value_of
@@ -82,6 +83,7 @@ class Operator:
         self._world, node = world, world.node
         self._pose = node.create_publisher(PoseStamped, 'goal_pose', 10)
         self._goals = node.create_publisher(Goals, 'goals', 10)
+        self._path = node.create_publisher(Path, 'path', 10)
         self._cmd_vel = node.create_publisher(Twist, 'cmd_vel', 10)
         self._cancel = node.create_client(Trigger, 'cancel_goal')
         self.status = world.listen(GoalStatus, 'goal_status')
@@ -98,6 +100,11 @@ class Operator:
         message = Goals(goals=[self._stamped(pose) for pose in poses])
         messages.set_time(message.header.stamp, self._world.now)
         self._goals.publish(message)
+
+    def path(self, poses):
+        message = Path(poses=[self._stamped(pose) for pose in poses])
+        messages.set_time(message.header.stamp, self._world.now)
+        self._path.publish(message)
 
     def cancel(self, _):
         self._cancel.call_async(Trigger.Request())
@@ -152,16 +159,6 @@ def chain(world, case):
     assert (twist.linear.x, twist.angular.z) == (0.0, 0.0), twist
 
 
-class Progress:
-    """What send_goal reports while it waits, by name."""
-
-    def __init__(self):
-        self.reports = []
-
-    def __getattr__(self, name):
-        return lambda *_: self.reports.append(name)
-
-
 def client(world, case):
     """A goal that send_goal sends and follows, under faults: what it reports is true."""
     add_nodes(world, case['start'], make_complete)
@@ -181,7 +178,7 @@ def client(world, case):
         patience=patience,
         timeout=timeout,
         signals=signals,
-        progress=Progress(),
+        progress=Mock(),
     )
     spent = world.world_time / NANOSECONDS
     longest = patience + timeout + 3.0 * ANSWER_PATIENCE

@@ -5,20 +5,15 @@
 
 from __future__ import annotations
 
-from geometry_msgs.msg import PoseStamped
+from explored_nodes import Operator, go_on_until
 from hypothesis import strategies as st
-from nav_msgs.msg import Path
-from std_srvs.srv import Trigger
 from support.lockstep_nodes import make
-from support.ros_messages import goal, path
 
 from diffdrive_jacobian import faults
-from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.relations import Late, Mirrored, Moved, Renamed, Repeated, Shifted
 from diffdrive_jacobian.testing import fault_schedules, goals, numbers, points, poses
-from diffdrive_jacobian.time_units import NANOSECONDS
 
 LAWS = ('pure_pursuit', 'kanayama', 'offset_point', 'dynamic_feedback')
 DISTURBED = 4.0
@@ -37,38 +32,27 @@ RELATIONS = (
 )
 
 
-def send(world, topic, kind, message):
-    """Publish a message with a stamp, whether or not anybody listens."""
-    publishers = {one.topic_name: one for one in world.node.publishers}
-    publisher = publishers.get(world.node.resolve_topic_name(topic))
-    set_time(message.header.stamp, world.now)
-    (publisher or world.node.create_publisher(kind, topic, 10)).publish(message)
-    world.settle()
-
-
 def driven(world, case):
     """Send goals, or a path, to go_to_goal, and cancel them."""
     x, y, theta = map(float, case['start'])
     world.create(lambda: make(VirtualRobot, publish_rate=RATE, x=x, y=y, theta=theta))
     law = {} if case['law'] is None else {'path_controller': case['law']}
     world.create(lambda: make(GoToGoal, **law))
-    cancel = world.node.create_client(Trigger, 'cancel_goal')
+    operator = Operator(world)
 
-    def drive(what):
-        if case['law'] is None:
-            send(world, 'goal_pose', PoseStamped, goal(*map(float, what)))
-        else:
-            places = [(x + float(dx), y + float(dy)) for dx, dy in what]
-            send(world, 'path', Path, path(*places))
+    def script():
+        for time, what in case['goals']:
+            if case['law'] is None:
+                yield time, 'goal', what
+            else:
+                yield time, 'path', [(x + float(dx), y + float(dy), 0.0) for dx, dy in what]
+        if case['cancel'] is not None:
+            yield case['cancel'], 'cancel', None
 
-    events = [(time, lambda what=what: drive(what)) for time, what in case['goals']]
-    if case['cancel'] is not None:
-        events.append((case['cancel'], lambda: cancel.call_async(Trigger.Request())))
-    for time, act in [*sorted(events, key=lambda event: event[0]), (END, world.settle)]:
-        left = time - world.world_time / NANOSECONDS
-        if left > 0.0:
-            world.run_for(left)
-        act()
+    for time, what, argument in sorted(script(), key=lambda action: action[0]):
+        go_on_until(world, time)
+        operator.do(what, argument)
+    go_on_until(world, END)
     world.settle()
 
 

@@ -143,19 +143,6 @@ def test_a_violation_is_one_of_a_property_with_the_same_hash_where_somebody_look
     assert pickle.loads(pickle.dumps(violation)).text == violation.text
 
 
-def test_a_node_that_speaks_first_is_compared():
-    """Whose timer ticks before anybody else has said anything."""
-
-    def ticking(world, case):
-        world.create(Source)
-        world.run_for(0.5)
-
-    ticks = Late('nothing', node='source'), Repeated('nothing', node='source')
-    for relation in ticks:
-        assert result(relation, ticking).compared == 0
-    assert result(Shifted(), ticking).compared == 6
-
-
 def test_numbers_between_others_are_late_as_they_may_be():
     """Also in arrays, as integers, and as the components of a quaternion. A single byte may not."""
 
