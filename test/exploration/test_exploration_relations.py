@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import exploration_scenarios as scenarios
+import pytest
 from exploration_scenarios import Follower, Sensor, follow, serial
 from hypothesis import strategies as st
 from support import inner_sessions  # noqa: F401  What it imports is not imported again.
@@ -77,6 +78,14 @@ def test_a_world_that_fails_is_compared_until_then_and_is_a_finding_by_its_error
     assert [one.violation.index for one in found.findings] == [-1]
 
 
+def test_a_relation_is_compared_without_the_faults_that_disturb_it():
+    lost = st.just([Loss('speed', start=0.2, duration=0.5)])
+    found = serial(follow, relations=[Repeated('speed')], faults=lost, worlds=1)
+    assert found.findings == ()
+    # The world, the same without faults, and the image of that.
+    assert found.simulated == pytest.approx(3 * 1.2)
+
+
 def test_what_was_never_compared_is_noted():
     found = serial(scenarios.mute, relations=[Repeated('speed')], worlds=1)
     assert "note: Repeated('speed'): nothing was compared" in str(found)
@@ -97,7 +106,6 @@ def test_nodes_without_faults_and_topics_that_nothing_checked_are_named():
     assert compared.unchecked == ('/speed',)
     # Nothing was affected without faults: that is known.
     assert (compared.nodes, compared.topics) == ((), ())
-    # A relation runs without the faults that disturb it.
     lost = fault_schedules(topics=['speed'], kinds=[Loss], max_faults=1, duration=1.0)
     found = serial(follow, relations=[Moved()], cases=SPEEDS, faults=lost, worlds=2)
     assert '  nodes that no fault affected: /follower, /sensor\n' in str(found)

@@ -9,6 +9,7 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
+from std_srvs.srv import Trigger
 from support.lockstep_nodes import Topics, change, make
 from support.ros_messages import instants, pose_of, twist, twists
 
@@ -205,6 +206,18 @@ def test_coarse_encoders_are_seen_by_the_odometry_alone_and_for_a_time(lockstep,
     # Afterwards the odometry goes on from where it was.
     jumps = np.diff([pose_of(one)[:2] for one in topics.odom], axis=0)
     assert np.hypot(*jumps.T).max() < R * increment + 0.2 / 50.0
+
+
+def test_coarse_odometry_can_be_reset(lockstep, robot_at):
+    robot = robot_at(x=0.5)
+    lockstep.inject(EncoderSteps(16))
+    drive(lockstep)
+    lockstep.run_for(0.3)
+    assert robot.pose[0] > 0.52
+    drive(lockstep, 0.0)
+    lockstep.call(Trigger, 'reset_odometry')
+    close(robot.pose, (0.5, 0.0, 0.0))
+    close(robot.truth, (0.56, 0.0, 0.0), 1e-9)
 
 
 @pytest.mark.parametrize('noticed', [False, True])
