@@ -220,8 +220,3 @@ def test_what_has_no_image_is_refused(kind):
     words = rf'Mirrored\(\) has no image of \w+/{kind.__name__} on /scan'
     with pytest.raises(LockstepError, match=words):
         Mirrored().image('/scan', kind())
-
-
-def test_fixed_frames_are_names():
-    with pytest.raises(ValueError, match='Moved: fixed must be'):
-        Moved(fixed='map')
