@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 import multiprocessing.spawn
 import os
-import random
 import signal
 import subprocess
 import sys
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
-from threading import Thread
 
 import numpy as np
 import pytest
-from exploration_scenarios import crowded, deadly, follow, nothing, serial
+from exploration_scenarios import crowded, deadly, follow, serial
 from hypothesis import strategies as st
 
 from diffdrive_jacobian import signals
@@ -95,17 +93,6 @@ def test_an_executor_explores_and_sweeps_as_this_thread_does_bit_for_bit(make, e
     for ours, theirs in zip(swept.outcomes, parts.outcomes, strict=True):
         assert ours.dtype == theirs.dtype
         np.testing.assert_array_equal(ours, theirs)
-
-
-def test_random_numbers_of_other_threads_do_not_end_the_generation_of_worlds():
-    def use_random_numbers(_):
-        """As the threads of Dask do at any time."""
-        thread = Thread(target=random.random)
-        thread.start()
-        thread.join()
-
-    cases = st.integers(0, 5).map(use_random_numbers)
-    assert serial(nothing, cases=cases, worlds=1).worlds == 1
 
 
 # --- Processes

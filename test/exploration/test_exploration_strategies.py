@@ -223,7 +223,9 @@ def test_source_names_what_it_imports_and_refuses_what_it_cannot_express():
         Source().expression([object()])
 
 
-def test_scenarios_are_found_by_name(tmp_path):
+def test_scenarios_are_found_by_name(tmp_path, monkeypatch):
+    # Where scenarios are found remains in the search path.
+    monkeypatch.setattr(sys, 'path', [*sys.path])
     name = ScenarioName.of(follow)
     assert (name.module, name.name) == ('exploration_scenarios', 'follow')
     assert name.load() is follow
@@ -234,25 +236,15 @@ def test_scenarios_are_found_by_name(tmp_path):
         scenario_from(tmp_path, 'nowhere', 'drive')
 
 
-def nested():
-    def scenario(world, case):
+def test_what_is_no_scenario_is_refused():
+    def nested(world, case):
         """Be in a function."""
 
-    return scenario
-
-
-@pytest.mark.parametrize(
-    ('wrong', 'words'),
-    [
-        (nested(), 'top level of a module'),
-        (lambda world, case: None, 'top level of a module'),
-        (3, 'top level of a module'),
-        (lost, 'takes 3'),
-    ],
-)
-def test_what_is_no_scenario_is_refused(wrong, words):
-    with pytest.raises(ExplorationError, match=words):
-        ScenarioName.of(wrong)
+    for wrong in (nested, lambda world, case: None, 3):
+        with pytest.raises(ExplorationError, match='top level of a module'):
+            ScenarioName.of(wrong)
+    with pytest.raises(ExplorationError, match='takes 3'):
+        ScenarioName.of(lost)
 
 
 def test_versions_are_compared():

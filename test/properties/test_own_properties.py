@@ -138,20 +138,21 @@ class Sender(Node):
 class Observes(Property):
     """Notes what it sees."""
 
-    topic: str
+    topic: str = 'joint_states'
+    received: str = 'joint_states'
     service: str = 'trigger'
 
     def begin(self):
         self.published, self.delivered, self.responses = [], [], []
         self.on_published(self.topic, lambda _, message: self.published.append(message))
-        self.on_delivered(self.topic, lambda node, kind, message: self.delivered.append(message))
+        self.on_delivered(self.received, lambda node, kind, message: self.delivered.append(message))
         self.on_response(self.service, lambda node, response: self.responses.append(response.message))
 
 
 def test_a_property_of_ones_own_gets_messages_also_of_bytes_and_of_slow_nodes(lockstep):
     """A node that is slow sends bytes: its messages leave later."""
     lockstep.node.create_subscription(JointState, 'joint_states', lambda _: None, 10, raw=True)
-    required = Observes('joint_states')
+    required = Observes()
     watch = required.watch(lockstep)
     lockstep.create(Sender)
     lockstep.inject(Slow('sender', 0.01))
@@ -162,22 +163,20 @@ def test_a_property_of_ones_own_gets_messages_also_of_bytes_and_of_slow_nodes(lo
     assert watch.responses == ['triggered']
     # The value itself has observed nothing.
     assert not hasattr(required, 'published')
-    assert required == Observes('joint_states') == watch
+    assert required == Observes() == watch
 
 
 def test_bytes_that_are_no_message_violate_a_property_of_ones_own(lockstep, publish):
-    lockstep.require(Observes('joint_states'))
+    lockstep.require(Observes())
     lockstep.create(Sender)
     publish('joint_states', b'\0', JointState)
     with pytest.raises(PropertyViolation, match=r'joint_states: bytes that are no JointState'):
         lockstep.settle()
 
 
-@pytest.mark.parametrize(
-    'required', [Observes('misspelt'), Observes('joint_states', 'misspelt')], ids=['topic', 'service']
-)
-def test_a_topic_or_a_service_that_nobody_has_is_an_error(lockstep, required):
-    lockstep.require(Observes('joint_states'), required)
+@pytest.mark.parametrize('name', ['topic', 'received', 'service'])
+def test_a_topic_or_a_service_that_nobody_has_is_an_error(lockstep, name):
+    lockstep.require(Observes(), Observes(**{name: 'misspelt'}))
     lockstep.create(Sender)
     lockstep.run_for(0.1)
     with pytest.raises(LockstepError, match=r"'misspelt'\) observes /misspelt, which no node has"):
