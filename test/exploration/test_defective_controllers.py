@@ -14,11 +14,23 @@ from diffdrive_jacobian.testing import Lockstep, PropertyViolation
 
 QUIET = ('--ros-args', '--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
 WORLDS = {
-    'no odometry timeout': ({}, [Loss('odom', start=1.0, duration=2.0)], 'StopsAfterLostOdometry'),
+    'no odometry timeout': (
+        {},
+        [Loss('odom', start=1.0, duration=2.0)],
+        'StopsAfterLostOdometry',
+    ),
     'wrong wrap of angles': ({}, [], 'StaysWithin'),
-    'integrates dt wrongly': ({}, [Hang('controller', start=0.1, duration=0.3)], 'AccelerationWithin'),
+    'integrates dt wrongly': (
+        {},
+        [Hang('controller', start=0.1, duration=0.3)],
+        'AccelerationWithin',
+    ),
     'ignores cancel': ({'cancel': 1.0}, [Loss('odom', duration=2.0)], 'NoCommandAfterCancel'),
-    'acts on stale goals': ({'cancel': 1.0}, [Duplicate('goal_pose', seconds=2.0)], 'NoStaleGoals'),
+    'acts on stale goals': (
+        {'cancel': 1.0},
+        [Duplicate('goal_pose', seconds=2.0)],
+        'NoStaleGoals',
+    ),
     'assumes message order': ({}, [Loss('odom', duration=1.0)], 'TypeError'),
     'divides by distance': ({'start': (0.0, 0.0, 0.0)}, [], 'ZeroDivisionError'),
     'does not stop on shutdown': ({'shutdown': 1.0}, [], 'StopsOnShutdown'),
@@ -37,7 +49,12 @@ WORLDS = {
 def run(controller, name):
     """Run the world of a defect with a controller."""
     particular, faults, _ = WORLDS[name]
-    case = {'start': (1.0, 0.0, 0.0), 'goals': [(0.0, (0.0, 0.0))], 'cancel': None, 'shutdown': None}
+    case = {
+        'start': (1.0, 0.0, 0.0),
+        'goals': [(0.0, (0.0, 0.0))],
+        'cancel': None,
+        'shutdown': None,
+    }
     with Lockstep(QUIET) as world:
         world.inject(*faults)
         world.require(*PROPERTIES)
@@ -55,7 +72,7 @@ def test_each_defect_is_found_by_a_property(name):
 
 
 @pytest.mark.parametrize('name', ['acts on stale goals', 'trusts stamps'])
-def test_no_property_finds_anything_in_the_right_controller(name):
+def test_properties_find_nothing_in_the_right_controller(name):
     run('no defect', name)
 
 
@@ -71,16 +88,21 @@ SHOWN = {
 def related(controller, relation):
     """Compare a drive with a controller to two goals."""
     goals = [(0.2, (0.0, 0.0)), (2.0, (-1.0, 0.3))]
-    case = {'start': (1.0, 0.5, 0.3), 'goals': goals, 'cancel': None, 'shutdown': None}
+    case = {
+        'start': (1.0, 0.5, 0.3),
+        'goals': goals,
+        'cancel': None,
+        'shutdown': None,
+    }
     check_relation(drive, relation, case={**case, 'controller': controller}, args=QUIET)
 
 
 @pytest.mark.parametrize('name', ARRIVING)
-def test_each_defect_that_no_property_shows_is_found_by_a_relation(name):
+def test_other_defects_are_found_by_a_relation(name):
     with pytest.raises(PropertyViolation):
         related(name, SHOWN[name])
 
 
 @pytest.mark.parametrize('relation', RELATIONS, ids=repr)
-def test_no_relation_finds_anything_in_the_right_controller(relation):
+def test_relations_find_nothing_in_the_right_controller(relation):
     related('no defect', relation)

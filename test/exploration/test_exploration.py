@@ -79,12 +79,15 @@ def test_a_finding_is_replayed(found, monkeypatch):
     assert mended.violation is None
     assert str(mended).startswith('not violated as it was found')
     elsewhere = Replay(
-        violation=None, same_verdict=True, same_bits=False, differences=('numpy 1 here, 2 there',)
+        violation=None,
+        same_verdict=True,
+        same_bits=False,
+        differences=('numpy 1 here, 2 there',),
     )
     assert str(elsewhere) == 'violated as found, but not bit for bit; numpy 1 here, 2 there'
 
 
-def test_the_written_test_reproduces_it_until_the_controller_is_mended(found, pytester, monkeypatch):
+def test_the_written_test_fails_until_the_controller_is_mended(found, pytester, monkeypatch):
     file = found.findings[0].directory / 'test_never_faster_than.py'
     options = ('-p', 'no:cacheprovider', '-p', 'no:xdist', '-p', 'no:launch_testing', file)
     result = pytester.runpytest_inprocess(*options)
@@ -101,7 +104,13 @@ def test_the_written_test_reproduces_it_until_the_controller_is_mended(found, py
 
 def test_each_property_and_each_exception_is_a_finding(tmp_path):
     """Also a property that the scenario requires."""
-    found = serial(divide, [NeverFasterThan(0.15, 1.0)], cases=SPEEDS, worlds=10, output=tmp_path)
+    found = serial(
+        divide,
+        [NeverFasterThan(0.15, 1.0)],
+        cases=SPEEDS,
+        worlds=10,
+        output=tmp_path,
+    )
     cases = {one.directory.name: one.trial.case['speed'] for one in found.findings}
     assert cases == {
         'NoExceptionZeroDivisionError': 0.0,
@@ -190,7 +199,7 @@ class Broken(SerialExecutor):
     ],
     ids=['exploring', 'shrinking', 'not ending'],
 )
-def test_what_was_found_is_kept_when_an_exploration_ends_early(tmp_path, error, number, stopped):
+def test_an_exploration_that_ends_early_keeps_what_was_found(tmp_path, error, number, stopped):
     arguments = {'cases': st.integers(50, 70), 'worlds': 21, 'time_limit': 1000.0}
     found = serial(failing, executor=Broken(number, error), output=tmp_path, **arguments)
     assert found.stopped.startswith(stopped)

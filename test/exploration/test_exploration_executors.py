@@ -80,7 +80,7 @@ def dask():
 
 
 @pytest.mark.parametrize('make', [processes, lambda: LocalExecutor(1), dask])
-def test_an_executor_explores_and_sweeps_as_this_thread_does_bit_for_bit(make, expected, monkeypatch):
+def test_an_executor_gives_the_results_of_this_thread(make, expected, monkeypatch):
     # One row of the grid for each task.
     monkeypatch.setattr(sys.modules[SweepSetup.__module__], 'LOOPS_PER_TASK', 1)
     found, swept = expected
@@ -123,7 +123,7 @@ def test_an_exception_in_the_process_of_a_thread_is_raised(local):
     assert local.submit(call_in_child, int, '7').result() == 7
 
 
-def test_an_error_of_a_process_that_cannot_be_pickled_or_described_is_reported():
+def test_an_error_that_cannot_be_pickled_or_described_is_reported():
     class LocalError(Exception):
         def __str__(self):
             raise ValueError('of a bug')

@@ -44,7 +44,7 @@ class Interrupting(SerialExecutor):
         raise KeyboardInterrupt
 
 
-def test_another_exploration_replaces_what_was_written_and_nothing_else(tmp_path, written):
+def test_another_exploration_replaces_only_what_was_written(tmp_path, written):
     """Not what the user has added, renamed or copied. One that is interrupted removes nothing."""
     output = tmp_path / 'found'
     folder = output / written.directory.name
@@ -67,7 +67,7 @@ def test_another_exploration_replaces_what_was_written_and_nothing_else(tmp_path
     assert [path.name for path in folder.iterdir()] == ['notes.txt']
 
 
-def test_a_relative_output_stays_where_it_was_beside_files_of_others(tmp_path, monkeypatch):
+def test_a_relative_output_stays_beside_files_of_others(tmp_path, monkeypatch):
     precious = tmp_path / 'found' / 'NoExceptionValueError' / 'run' / 'precious'
     precious.parent.mkdir(parents=True)
     precious.touch()
@@ -124,7 +124,7 @@ def contents(folder):
 
 
 @pytest.mark.parametrize('what', [*IN_THE_WAY, *CHANGED])
-def test_what_somebody_else_has_written_or_changed_stays(tmp_path, written, what):
+def test_what_somebody_else_has_written_stays(tmp_path, written, what):
     """With the rest of its folder: a changed test needs the case."""
     folder = tmp_path / 'found' / written.directory.name
     folder.parent.mkdir()
@@ -151,8 +151,8 @@ def unfinished(world, case):
     world.run_until(lambda: False, timeout=0.3, what='the last corner')
 
 
-def test_a_case_a_bag_and_a_test_are_written_and_an_exception_is_described_by_its_first_line(tmp_path):
-    """Not by the last line of the report that follows it."""
+def test_a_case_a_bag_and_a_test_are_written(tmp_path):
+    """An exception is described by its first line, not by the last one of the report after it."""
     loss = Loss('speed', start=0.1, duration=0.1)
     (finding,) = serial(unfinished, faults=st.just([loss]), worlds=1, output=tmp_path).findings
     expected = 'LockstepError: not within 0.3 s of simulated time: the last corner'
@@ -233,7 +233,7 @@ def test_whatever_an_error_is_its_finding_is_kept(tmp_path, case, properties):
     assert 'the same as found, bit for bit' in error.value.__notes__[0]
 
 
-def test_a_long_property_is_cut_and_the_picture_marks_when_it_is_violated(tmp_path, monkeypatch):
+def test_a_long_property_is_cut_and_the_picture_marks_the_time(tmp_path, monkeypatch):
     """At its time since the first odometry, with the name of the property."""
     drawn = []
     monkeypatch.setattr(rendering, 'render', lambda one, ending: drawn.append(one) or b'')

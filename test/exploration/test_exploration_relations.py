@@ -34,7 +34,12 @@ DOUBLED = Doubled(node='follower')
 
 def test_a_relation_is_found_shrunk_and_replayed():
     relations = [DOUBLED, Mirrored(node='follower')]
-    found = serial(follow, relations=relations, cases=SPEEDS, worlds=5)
+    found = serial(
+        follow,
+        relations=relations,
+        cases=SPEEDS,
+        worlds=5,
+    )
     (finding,) = found.findings
     assert finding.violation.key == "Doubled(node='follower')"
     assert finding.count == 5
@@ -69,7 +74,7 @@ def test_the_written_test_compares_again(tmp_path, pytester):
     )
 
 
-def test_a_world_that_fails_is_compared_until_then_and_is_a_finding_by_its_error():
+def test_a_world_that_fails_is_compared_until_then():
     relations = [Repeated('speed')]
     found = serial(scenarios.divide, relations=relations, cases=SPEEDS, worlds=4)
     assert {one.violation.index for one in found.findings} == {-1}
@@ -80,7 +85,12 @@ def test_a_world_that_fails_is_compared_until_then_and_is_a_finding_by_its_error
 
 def test_a_relation_is_compared_without_the_faults_that_disturb_it():
     lost = st.just([Loss('speed', start=0.2, duration=0.5)])
-    found = serial(follow, relations=[Repeated('speed')], faults=lost, worlds=1)
+    found = serial(
+        follow,
+        relations=[Repeated('speed')],
+        faults=lost,
+        worlds=1,
+    )
     assert found.findings == ()
     # The world, the same without faults, and the image of that.
     assert found.simulated == pytest.approx(3 * 1.2)
@@ -94,10 +104,22 @@ def test_what_was_never_compared_is_noted():
 # --- What no world has touched
 
 
-def test_nodes_without_faults_and_topics_that_nothing_checked_are_named():
-    faults = st.sampled_from([[Loss('speed', duration=0.5)], [Hang('follower', duration=0.5)], []])
+def test_nodes_without_faults_and_unchecked_topics_are_named():
+    faults = st.sampled_from(
+        [
+            [Loss('speed', duration=0.5)],
+            [Hang('follower', duration=0.5)],
+            [],
+        ]
+    )
     required = [NeverFasterThan(90.0, 90.0)]
-    found = serial(follow, required, cases=SPEEDS, faults=faults, worlds=10)
+    found = serial(
+        follow,
+        required,
+        cases=SPEEDS,
+        faults=faults,
+        worlds=10,
+    )
     unseen = found.unseen
     assert (unseen.nodes, unseen.topics, unseen.silent) == (('/sensor',), (), ())
     assert unseen.unchecked == ('/speed',)
@@ -121,7 +143,7 @@ def with_parameters(world, case):
     world.run_for(0.3)
 
 
-def test_parameters_with_one_value_and_topics_without_messages_are_named():
+def test_constant_parameters_and_silent_topics_are_named():
     change = [ParameterChange('follower', 'changed', 2.0, start=0.1)]
     faults = st.sampled_from([change, []])
     unseen = serial(with_parameters, cases=st.integers(1, 9), faults=faults, worlds=8).unseen

@@ -139,7 +139,7 @@ def test_faults_are_of_their_kinds_and_have_ended_in_time(schedule, others):
                 assert fault.amount != 0.0
 
 
-def test_kinds_are_those_that_are_asked_for_also_of_ones_own_and_endless():
+def test_kinds_of_faults_may_be_chosen():
     jumps = fault_schedules(['odom'], ['robot'], kinds=[faults.TimeJump], max_faults=1)
     assert type(find(jumps, bool, settings=SHRINK)[0]) is faults.TimeJump
     own = faults.ParameterChange('robot', 'kp', 2.0)
@@ -152,7 +152,7 @@ def test_kinds_are_those_that_are_asked_for_also_of_ones_own_and_endless():
 # --- Generation
 
 
-def test_a_block_depends_on_its_seed_and_number_alone_also_while_shrinking(tmp_path, monkeypatch):
+def test_a_block_depends_on_its_seed_and_number_alone(tmp_path, monkeypatch):
     strategy = trials(st.fixed_dictionaries({'x': st.integers()}), fault_schedules(['odom']))
     before = generate(strategy, 1, 2, 50)
     assert len(before) == 50
@@ -214,7 +214,7 @@ def test_source_evaluates_to_the_value(value):
     assert eval(text, names) == value
 
 
-def test_source_names_what_it_imports_and_refuses_what_it_cannot_express():
+def test_source_names_its_imports_and_refuses_other_objects():
     source = Source()
     assert source.expression(faults.Loss('odom', start=1.0)) == "Loss('odom', start=1.0)"
     assert source.imports == {('diffdrive_jacobian.faults', 'Loss')}

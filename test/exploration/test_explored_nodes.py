@@ -18,7 +18,7 @@ def test_nothing_is_found_in_our_nodes(name, tmp_path):
 
 
 @pytest.mark.parametrize('law', [None, *related_nodes.LAWS])
-def test_no_relation_finds_anything_in_our_controller(law):
+def test_relations_find_nothing_in_our_controller(law):
     cases, faults = related_nodes.cases(law), related_nodes.schedules()
     result = serial(
         related_nodes.driven, relations=related_nodes.RELATIONS, cases=cases, faults=faults, worlds=1

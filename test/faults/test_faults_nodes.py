@@ -44,7 +44,7 @@ def test_a_killed_node_stops_at_once_and_is_made_again(lockstep, relay):
     assert whats(lockstep) == ['begins', '/relay is killed', '/relay is started again', 'ends']
 
 
-def test_a_node_that_is_not_there_when_the_fault_begins_is_neither_killed_nor_made(lockstep, relay):
+def test_a_node_that_is_not_there_is_neither_killed_nor_made(lockstep, relay):
     lockstep.remove(relay)
     lockstep.inject(faults.Kill('relay', duration=0.1), faults.Kill('late', duration=0.2))
     late = lockstep.create(lambda: Sink('late'))
@@ -77,7 +77,7 @@ def test_a_node_that_is_made_again_receives_latched_messages(lockstep):
     assert lockstep.find('sink').received == [(2, 450.0), (3, 450.0), (4, 450.0), (5, 500.0)]
 
 
-def test_a_node_that_is_killed_twice_rises_when_both_faults_are_over(lockstep, relay):
+def test_a_node_that_is_killed_twice_rises_after_both_faults(lockstep, relay):
     lockstep.inject(
         faults.Kill('relay', start=0.15, duration=0.4), faults.Kill('relay', start=0.35, duration=0.4)
     )
@@ -131,7 +131,10 @@ HELD = {
         [100.0, 200.0, 550.0, 600.0, 700.0, 800.0, 900.0],
     ),
     'frozen twice': (
-        [faults.Hang('relay', start=0.15, duration=0.3), faults.Hang('relay', start=0.3, duration=0.45)],
+        [
+            faults.Hang('relay', start=0.15, duration=0.3),
+            faults.Hang('relay', start=0.3, duration=0.45),
+        ],
         [*in_time(1, 1), *at(750.0, 2, 3, 4, 5, 6, 7), *in_time(8, 9)],
         [*in_time(1, 1), *at(750.0, 2, 3, 4, 5, 6, 7), *in_time(8, 9)],
         [100.0, 750.0, 800.0, 900.0],
@@ -164,7 +167,7 @@ def test_a_node_that_is_held_continues_with_what_waits(lockstep, relay, how):
     assert relay.ticks == ticks
 
 
-def test_the_queues_of_a_frozen_node_lose_the_oldest_and_it_responds_late(lockstep):
+def test_a_frozen_node_loses_the_oldest_messages_and_responds_late(lockstep):
     relay = lockstep.create(lambda: Relay(profile=2))
     lockstep.create(Source)
     relay.received.clear()
@@ -177,7 +180,7 @@ def test_the_queues_of_a_frozen_node_lose_the_oldest_and_it_responds_late(lockst
     assert '3 messages and requests wait, lost from full queues: 3 of /count' in whats(lockstep)
 
 
-def test_a_frozen_node_receives_responses_and_continues_its_tasks_late(lockstep):
+def test_a_frozen_node_continues_its_tasks_late(lockstep):
     order = []
     asking = lockstep.create(lambda: Node('asking'))
     client = asking.create_client(Trigger, 'ask')
@@ -226,7 +229,7 @@ def test_a_slow_node_loses_messages_from_a_full_queue(lockstep):
     assert 'lost from full queues: ' in whats(lockstep)[-2]
 
 
-def test_a_slow_service_responds_late_and_serves_one_after_the_other(lockstep):
+def test_a_slow_service_serves_one_request_after_the_other(lockstep):
     relay = lockstep.create(lambda: Relay(period=99.0))
     client, answers = lockstep.node.create_client(Trigger, 'ask'), []
     lockstep.inject(faults.Slow('relay', 0.2))
@@ -243,7 +246,7 @@ def test_a_slow_service_responds_late_and_serves_one_after_the_other(lockstep):
 
 
 @pytest.mark.parametrize(('most', 'ticks'), [(30.0, range(11, 12)), (500.0, range(2, 9))])
-def test_ticks_come_late_by_a_random_time_or_replace_those_between(lockstep, relay, most, ticks):
+def test_ticks_are_late_or_replace_those_between(lockstep, relay, most, ticks):
     lockstep.inject(faults.TimerJitter('relay', most / 1000.0, start=0.15, duration=0.7), seed=3)
     lockstep.run_for(1.1)
     late = [tick % 100.0 for tick in relay.ticks]
@@ -256,7 +259,7 @@ def test_ticks_come_late_by_a_random_time_or_replace_those_between(lockstep, rel
         assert len(set(late[1:8])) == 7
 
 
-def test_a_parameter_is_changed_and_changed_back_also_where_changes_overlap(lockstep, relay):
+def test_a_parameter_is_changed_and_changed_back(lockstep, relay):
     gains = []
     lockstep.node.create_timer(0.1, lambda: gains.append(relay.get_parameter('gain').value))
     for value, start, duration in (
@@ -272,7 +275,7 @@ def test_a_parameter_is_changed_and_changed_back_also_where_changes_overlap(lock
     assert whats(lockstep)[-2:] == ['gain is 1.0, was 7.0', 'ends']
 
 
-def test_a_refused_value_is_an_event_and_an_unknown_parameter_an_error(lockstep, relay):
+def test_a_refused_value_is_an_event_and_an_unknown_name_an_error(lockstep, relay):
     lockstep.inject(faults.ParameterChange('relay', 'gain', 'high'))
     assert whats(lockstep)[1].startswith("gain = 'high' is refused: ")
     assert relay.get_parameter('gain').value == 1.0

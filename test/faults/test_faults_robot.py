@@ -76,7 +76,7 @@ def test_a_lagging_robot_reaches_the_command_and_is_then_an_ordinary_one():
         robot.at(SECOND).at(SECOND - 1)
 
 
-def test_odometry_of_coarse_encoders_stays_within_their_increment_of_the_truth():
+def test_coarse_odometry_stays_within_an_increment_of_the_truth():
     rng = np.random.default_rng(4)
     increment = math.tau / 20
     robot = first = at_rest().commanded((0.3, 1.0), 0).at(SECOND // 7)
@@ -150,7 +150,7 @@ def measured(topics):
     return twists([topics.odom[-1].twist])[0]
 
 
-def test_a_motor_dies_under_a_command_that_is_held_and_lives_again(lockstep, robot_at):
+def test_a_motor_dies_under_a_command_and_lives_again(lockstep, robot_at):
     robot = robot_at(cmd_vel_timeout=0.0)
     topics = Topics(lockstep)
     lockstep.inject(DeadWheel('left', start=0.5, duration=0.5))
@@ -185,7 +185,7 @@ def test_a_lagging_robot_is_seen_in_its_odometry_and_commands(lockstep, robot_at
     assert np.diff(instants(topics.applied))[-1] == SECOND // 2
 
 
-def test_coarse_encoders_are_seen_by_the_odometry_alone_and_for_a_time(lockstep, robot_at):
+def test_coarse_encoders_are_seen_by_the_odometry_alone(lockstep, robot_at):
     robot_at(cmd_vel_timeout=0.0)
     topics = Topics(lockstep)
     truths = lockstep.listen(Odometry, 'ground_truth')
@@ -221,7 +221,7 @@ def test_coarse_odometry_can_be_reset(lockstep, robot_at):
 
 
 @pytest.mark.parametrize('noticed', [False, True])
-def test_a_push_moves_the_robot_and_its_odometry_only_if_it_is_noticed(lockstep, robot_at, noticed):
+def test_a_push_moves_the_odometry_only_if_it_is_noticed(lockstep, robot_at, noticed):
     robot = robot_at(x=1.0, theta=math.pi / 2.0)
     topics = Topics(lockstep)
     truths = lockstep.listen(Odometry, 'ground_truth')
@@ -239,7 +239,7 @@ def test_a_push_moves_the_robot_and_its_odometry_only_if_it_is_noticed(lockstep,
     close(pose_of((starts or truths)[-1]), moved)
 
 
-def test_wrong_geometry_for_a_time_is_seen_by_the_truth_alone_and_multiplies(lockstep, robot_at):
+def test_wrong_geometry_multiplies_and_is_seen_by_the_truth_alone(lockstep, robot_at):
     robot = robot_at(cmd_vel_timeout=0.0, true_wheel_separation_multiplier=3.0)
     topics = Topics(lockstep)
     half = {'wheel_separation_multiplier': 0.5, 'start': 0.5, 'duration': 0.5}
@@ -287,7 +287,7 @@ def test_the_weakest_motor_counts_and_parameters_still_change(lockstep, robot_at
     assert np.array(seen) == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_fault_applies_to_a_robot_that_comes_later_and_again_but_pushes_it_once(lockstep):
+def test_a_fault_applies_to_a_robot_that_comes_later_or_again(lockstep):
     lockstep.inject(DeadWheel('left'), Push(0.5), Kill('virtual_robot', start=0.2, duration=0.2))
     topics = Topics(lockstep)
     lockstep.create(lambda: make(VirtualRobot, cmd_vel_timeout=0.0))
@@ -301,7 +301,7 @@ def test_a_fault_applies_to_a_robot_that_comes_later_and_again_but_pushes_it_onc
     lockstep.check_faults()
 
 
-def test_a_fault_without_a_robot_is_reported_and_one_of_another_node_refused(lockstep):
+def test_a_fault_needs_a_robot_of_its_name(lockstep):
     lockstep.inject(DeadWheel('left', robot='robot'))
     lockstep.run_for(0.1)
     with pytest.raises(LockstepError, match=r'DeadWheel.*no node /robot was seen'):

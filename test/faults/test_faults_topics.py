@@ -60,7 +60,7 @@ def test_a_burst_loses_messages_in_a_row(lockstep):
     assert all(gap % 4 == 0 for gap in gaps)
 
 
-def test_a_random_delay_keeps_the_order_also_after_its_end_and_reordering_does_not(lockstep):
+def test_a_random_delay_keeps_the_order_and_reordering_does_not(lockstep):
     got = play(lockstep, faults.Delay('count', 0.0, spread=0.5, duration=0.75), seconds=2.0, seed=4)
     assert [number for number, _ in got] == list(range(1, 21))
     late = [time - 100.0 * number for number, time in got]
@@ -74,7 +74,7 @@ def test_a_random_delay_keeps_the_order_also_after_its_end_and_reordering_does_n
     assert {number for number, _ in got} >= set(range(21, 39))
 
 
-def test_each_subscription_and_fault_has_random_numbers_which_depend_on_nothing_else(lockstep):
+def test_each_subscription_and_fault_has_random_numbers_of_its_own(lockstep):
     loss = faults.Loss('count', probability=0.5)
     one, two = (lockstep.add(Sink(name)) for name in ('one', 'two'))
     lockstep.inject(loss, seed=7)
@@ -155,7 +155,7 @@ def events(world):
     return [(event.time_ns / 1e9, event.what) for event in world.fault_events]
 
 
-def test_events_name_what_has_happened_to_which_messages_and_are_recorded(lockstep, recorded_run):
+def test_events_name_the_affected_messages_and_are_recorded(lockstep, recorded_run):
     play(lockstep, faults.Loss('count', start=0.3, duration=0.3), faults.Stale('count', start=0.65))
     assert events(lockstep) == [
         (0.3, 'begins'),

@@ -93,15 +93,22 @@ def test_numbers_of_all_types_are_compared(lockstep, publish, message, field, lo
         ('header', "field 'header' is no number but std_msgs/Header"),
     ],
 )
-def test_a_field_that_is_none_or_no_number_is_an_error(lockstep, publish, field, words):
+def test_a_field_that_is_no_number_is_an_error(lockstep, publish, field, words):
     lockstep.require(FieldWithin('joint_states', field, -1.0, 1.0))
     with pytest.raises(LockstepError, match=words):
         publish('joint_states', joints(0.0))
     lockstep.close()
 
 
-@pytest.mark.parametrize(('field', 'messages'), [('position[2]', 3), ('velocity', 3), ('position', 0)])
-def test_a_field_that_no_message_had_is_an_error_because_nothing_was_checked(lockstep, field, messages):
+@pytest.mark.parametrize(
+    ('field', 'messages'),
+    [
+        ('position[2]', 3),
+        ('velocity', 3),
+        ('position', 0),
+    ],
+)
+def test_a_field_that_no_message_had_is_an_error(lockstep, field, messages):
     publisher = lockstep.node.create_publisher(JointState, 'joint_states', 10)
     lockstep.require(FieldWithin('joint_states', field, -1.0, 1.0))
     for _ in range(messages):
@@ -149,7 +156,7 @@ class Observes(Property):
         self.on_response(self.service, lambda node, response: self.responses.append(response.message))
 
 
-def test_a_property_of_ones_own_gets_messages_also_of_bytes_and_of_slow_nodes(lockstep):
+def test_an_own_property_gets_messages_also_of_slow_nodes(lockstep):
     """A node that is slow sends bytes: its messages leave later."""
     lockstep.node.create_subscription(JointState, 'joint_states', lambda _: None, 10, raw=True)
     required = Observes()
@@ -166,7 +173,7 @@ def test_a_property_of_ones_own_gets_messages_also_of_bytes_and_of_slow_nodes(lo
     assert required == Observes() == watch
 
 
-def test_bytes_that_are_no_message_violate_a_property_of_ones_own(lockstep, publish):
+def test_bytes_that_are_no_message_violate_an_own_property(lockstep, publish):
     lockstep.require(Observes())
     lockstep.create(Sender)
     publish('joint_states', b'\0', JointState)
@@ -245,7 +252,7 @@ def test_what_was_found_counts_whatever_check_returns(lockstep, publish):
         lockstep.settle()
 
 
-def test_a_property_must_be_a_dataclass_without_the_names_that_each_property_has(lockstep):
+def test_a_property_is_a_dataclass_without_reserved_names(lockstep):
     class Mine(Property):
         def __init__(self, limit):
             self.limit = limit

@@ -43,7 +43,7 @@ def send(lockstep):
 # --- Requiring
 
 
-def test_a_violation_names_property_time_value_limit_and_what_was_before(lockstep, send):
+def test_a_violation_names_property_time_value_and_limit(lockstep, send):
     lockstep.require(SLOW)
     send(twist(0.25))
     lockstep.run_for(1.0)
@@ -98,7 +98,7 @@ def test_what_is_no_property_cannot_be_required(lockstep):
             lockstep.require(argument)
 
 
-def test_a_topic_that_nobody_could_publish_on_is_an_error_at_the_end(lockstep, send):
+def test_a_topic_without_publisher_is_an_error_at_the_end(lockstep, send):
     lockstep.require(NeverFasterThan(0.5, 2.0, topic='cmd_vell'))
     send(twist(0.1))
     lockstep.run_for(0.1)

@@ -79,7 +79,7 @@ def go_to_goal():
 # --- Status, goals and paths
 
 
-def test_only_a_goal_without_identifier_may_be_accepted_again_when_it_is_received_again(lockstep, scene):
+def test_only_a_goal_without_identifier_may_be_accepted_again(lockstep, scene):
     uuid, goal = 0, goal_at(0.0, stamp=3)
 
     def answer(goal):
@@ -136,7 +136,7 @@ def with_paths(lockstep):
     return lockstep
 
 
-def test_a_path_after_a_cancel_is_driven_without_an_accusation(with_paths):
+def test_a_path_after_a_cancel_may_be_driven(with_paths):
     with_paths.require(NoCommandAfterCancel())
     with_paths.require(StatusProtocol())
     with_paths.send_path(2.0)
@@ -190,7 +190,7 @@ def test_goals_after_a_jump_of_the_clock_are_not_old(lockstep, scene):
     scene(status(ACCEPTED, stamp=2))
 
 
-def test_a_goal_that_is_canceled_is_not_due_whoever_records_it(lockstep, robot_at, recorded_run):
+def test_a_canceled_goal_is_not_due_for_the_recorder_either(lockstep, robot_at, recorded_run):
     """The recorder receives the goal, too, but its goal is not canceled."""
     robot_at()
     lockstep.add(make(GoToGoal))

@@ -129,7 +129,7 @@ def test_texts_may_have_the_namespace_or_not():
     check_relation(scenario, Renamed('r1'))
 
 
-def test_a_violation_is_one_of_a_property_with_the_same_hash_where_somebody_looks_into_it(monkeypatch):
+def test_a_violation_has_the_same_hash_with_and_without_a_pause(monkeypatch):
     """So a written test says whether it is as found, with a pause, too."""
     monkeypatch.setattr('sys.breakpointhook', lambda **_: None)
     digests = []
@@ -275,7 +275,7 @@ def test_a_node_is_under_test_again_after_it_was_killed():
     assert result(NEGATED, broken, faults=killed).difference.time == 200_000_000
 
 
-def test_requests_and_ends_that_overtake_what_is_late_end_the_comparison():
+def test_requests_that_overtake_what_is_late_end_the_comparison():
     def asking(world, case):
         scene(total, end=0.5)(world, case)
         world.call(Trigger, 'forget')
@@ -391,9 +391,7 @@ def apart(world, case):
         (failing, NEGATED, {'case': 7}, KeyError, '7'),
     ],
 )
-def test_scenarios_and_faults_that_cannot_be_compared_are_errors(
-    scenario, relation, arguments, error, text
-):
+def test_what_cannot_be_compared_is_an_error(scenario, relation, arguments, error, text):
     with pytest.raises(error, match=text):
         check_relation(scenario, relation, args=QUIET, **arguments)
 

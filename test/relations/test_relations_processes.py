@@ -24,7 +24,7 @@ def answering(world, name):
         world.run_for(0.1)
 
 
-def test_a_program_that_counts_is_found_and_one_that_does_what_it_must_is_not():
+def test_only_a_program_that_counts_is_found():
     check_relation(answering, Late('echo/in', 0.04), case='echo')
     words = r"Repeated\('ticker/in'\) is violated at 0.05 s: /ticker"
     with pytest.raises(PropertyViolation, match=words):

@@ -116,7 +116,7 @@ def test_a_pose_is_moved_and_mirrored_as_by_matrices(seed):
     assert of_pose(mirrored) == pytest.approx(MIRROR @ before @ MIRROR)
 
 
-def test_covariances_are_transformed_as_their_poses_and_twists():
+def test_covariances_are_transformed_as_by_matrices():
     rotation = np.kron(np.eye(2), MOVE[:3, :3])
     expected = rotation @ covariance() @ rotation.T
     moved = MOTION.image('odom', odometry())
@@ -132,7 +132,7 @@ def test_covariances_are_transformed_as_their_poses_and_twists():
     assert [one for one in MOTION.image('odom', unknown).pose.covariance if one] == [math.inf]
 
 
-def test_twists_are_those_of_the_robot_unless_their_frame_is_fixed():
+def test_twists_are_turned_only_in_fixed_frames():
     assert MOTION.image('cmd_vel', twist()) == twist()
     assert MOTION.image('acceleration', Accel(linear=vector())) == Accel(linear=vector())
     before, mirrored = twist(), Mirrored().image('cmd_vel', twist())
