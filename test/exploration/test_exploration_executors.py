@@ -38,15 +38,6 @@ SPEEDS = st.fixed_dictionaries({'speed': st.sampled_from([0.0, 1.0, 2.0])})
 SETUP = SweepSetup(grid=3, starts=2, rate=20.0)
 
 
-@pytest.fixture(autouse=True)
-def forked_children(monkeypatch, forked_python):
-    """Start processes of worlds as forks. Those of multiprocessing are new interpreters.
-
-    multiprocessing.spawn keeps which interpreter that is when it is imported.
-    """
-    monkeypatch.setattr(sys, 'executable', str(forked_python))
-
-
 @pytest.fixture(scope='module')
 def local():
     """Return the default executor, with one process for all tests."""
@@ -62,10 +53,7 @@ def expected():
 
 @contextmanager
 def processes():
-    # Their own processes are forks, too.
-    program = f'import sys; sys.executable = {sys.executable!r}'
-    context = multiprocessing.get_context('spawn')
-    with ProcessPoolExecutor(1, context, initializer=exec, initargs=(program,)) as executor:
+    with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as executor:
         yield executor
 
 

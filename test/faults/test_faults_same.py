@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from fork_server import forked
 from support.lockstep_nodes import make
 from support.processes import run_python
 from support.ros_messages import goal
@@ -65,5 +64,5 @@ def test_schedules_are_the_same_each_time_also_in_another_process():
         f'import sys; sys.path[:0] = {[str(here), str(here.parent)]}\n'
         f'import test_faults_same as t; print(*map(t.drive, range({len(SCHEDULES)})))'
     )
-    run = forked.run(program, timeout=120)
+    run = run_python(program, timeout=120)
     assert run.stdout.split() == first, run.stderr

@@ -35,5 +35,5 @@ class Twice(Repeated):
 
 def test_only_a_program_that_counts_is_found():
     check_relation(answering, Late('echo/in', 0.04), case='echo')
-    with pytest.raises(PropertyViolation, match='is violated at 0.05 s: /ticker'):
+    with pytest.raises(PropertyViolation, match=r'is violated at 0\.05 s: /ticker'):
         check_relation(answering, Twice('ticker/in'), case='ticker')
