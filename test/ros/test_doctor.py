@@ -70,11 +70,11 @@ def test_an_observer_describes_what_it_sees(ros):
 
 
 def test_an_observer_ignores_names_that_cannot_be_queried(ros, monkeypatch):
-    few_services = {'start_type_description_service': False}
-    ros.add(Node, node_name='n' * 240, start_parameter_services=False, parameters=few_services)
+    """As of programs that use DDS without ROS, or too long for a service."""
+    long = {'start_type_description_service': False}
+    ros.add(Node, node_name='n' * 240, start_parameter_services=False, parameters=long)
     ros.add(Node, node_name='usual')
     observer = ros.add(Observer, name='_doctor')
-    # As of programs that use DDS without ROS.
     others = [('/not-a-name', ['a/msg/B']), ('/9', ['nav_msgs/msg/Odometry'])]
     query = observer.get_topic_names_and_types
     monkeypatch.setattr(observer, 'get_topic_names_and_types', lambda: [*query(), *others])
@@ -82,7 +82,7 @@ def test_an_observer_ignores_names_that_cannot_be_queried(ros, monkeypatch):
     def clocks():
         return {node.name: node.use_sim_time for node in observer.describe(1.0).nodes}
 
-    ros.until(lambda: clocks().get('/usual') is False, 'the clock of the usual node is known')
+    ros.until(lambda: clocks().get('/usual') is False, 'the clock is known')
     assert any('nnn' in name for name in clocks())
     assert '/not-a-name' not in observer.describe(1.0).topics()
 

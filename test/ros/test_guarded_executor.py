@@ -79,7 +79,6 @@ class Served:
         return future, done
 
     def move(self):
-        """Move the nodes to the other executor."""
         self.executor.use_single_threaded()
 
 
