@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from functools import partial
 
 import pytest
 from rclpy.node import Node
@@ -152,20 +151,17 @@ def test_one_message_of_each_of_many_topics_moves_nothing(served):
         assert served.spin(lambda: len(received) == 30 * count) == {False}  # noqa: B023
 
 
-async def _awaiting(take, message):
-    take(message)
-
-
-@pytest.mark.parametrize(
-    'make_callback',
-    [lambda take: lambda message, info: take((message, info)), lambda take: partial(_awaiting, take)],
-    ids=['message info', 'coroutine'],
-)
-def test_callbacks_that_need_a_wait_set_get_it(served, make_callback):
+@pytest.mark.parametrize('kind', ['message info', 'coroutine'])
+def test_callbacks_that_need_a_wait_set_get_it(served, kind):
     received = []
+
+    async def awaiting(message):
+        received.append(message)
+
+    callbacks = {'coroutine': awaiting, 'message info': lambda _, info: received.append(info)}
     other = Node('other', context=served.context)
     served.nodes.append(other)
-    other.create_subscription(String, 'words', make_callback(received.append), 10)
+    other.create_subscription(String, 'words', callbacks[kind], 10)
     served.executor.add_node(other)
     assert served.executor.fair
     served.publish(['word'])
