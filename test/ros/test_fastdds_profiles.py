@@ -132,7 +132,8 @@ def test_messages_are_received_through_udp(monkeypatch):
         monkeypatch.setenv(SWITCH, switch)
         ended = run_python(RECEIVING, timeout=60)
         assert ended.returncode == 0
-        assert bool(re.search(r'^fastrtps_port\d+_el$', ended.stdout, re.MULTILINE)) == expected
+        found = re.search(r'^fastrtps_port\d+_el$', ended.stdout, re.MULTILINE)
+        assert bool(found) == expected
 
 
 # The entry point runs in an empty folder; what it would give to Fast DDS is printed.
@@ -150,6 +151,10 @@ virtual_robot()
 @pytest.mark.process
 def test_entry_points_announce_themselves():
     ended = subprocess.run(
-        [sys.executable, '-c', PRINTING], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, '-c', PRINTING],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
     )
     assert ended.stdout == 'announcements_heartbeats.xml\n'

@@ -22,7 +22,7 @@ from diffdrive_jacobian.ros.runner import make_executor, ros_context
 
 @pytest.fixture
 def create():
-    """Return a function that creates a node in a namespace, which is destroyed at the end."""
+    """Return a function that creates a node in a namespace."""
     nodes = []
     with ros_context(['test']) as context:
 
@@ -42,7 +42,7 @@ def check(*nodes, times=FAULT_PATIENCE):
             node._check_graph()
 
 
-def test_a_fault_that_appears_after_many_checks_is_reported_each_time_by_each_node(create, capfd):
+def test_a_fault_is_reported_each_time_that_it_appears_by_each_node(create, capfd):
     robots = [create(VirtualRobot, name) for name in ('a', 'b')]
     other = create(Node, '', node_name='other')
     check(*robots, times=20)
@@ -80,7 +80,7 @@ def test_other_types_are_reported_once_until_they_are_gone(create, capfd, monkey
 
 
 def test_a_topic_of_another_type_in_another_process_is_reported(monkeypatch, capfd):
-    """Two contexts are two participants, as two processes are; they meet on this machine only."""
+    """Two contexts are two participants, as two processes are."""
     monkeypatch.setattr(ros_node, 'WATCH_PERIOD', 0.1)
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id()))
@@ -92,10 +92,8 @@ def test_a_topic_of_another_type_in_another_process_is_reported(monkeypatch, cap
         said = harness.until_said(capfd, 'enable_stamped_cmd_vel')
         harness.close()
         peer.destroy_node()
-    assert (
-        '/mismatched publishes /cmd_vel as geometry_msgs/msg/TwistStamped, but this node subscribes to '
-        'it as geometry_msgs/msg/Twist: no message will arrive' in said
-    )
+    assert '/mismatched publishes /cmd_vel as geometry_msgs/msg/TwistStamped' in said
+    assert 'but this node subscribes to it as geometry_msgs/msg/Twist' in said
 
 
 @pytest.mark.parametrize('node_class', [GoToGoal, WheelBridge])

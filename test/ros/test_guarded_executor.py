@@ -1,4 +1,4 @@
-"""The executor of the entry points: when it moves its nodes, and that the move loses nothing."""
+"""The executor of the entry points moves its nodes in a flood, and loses nothing."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Served:
             self.publisher.publish(serialize_message(String(data=str(word))))
 
     def spin(self, until):
-        """Execute callbacks until a condition holds; return the values of `fair` meanwhile."""
+        """Execute callbacks until a condition holds. Return the values of `fair`."""
         deadline, fair = time.monotonic() + PATIENCE, set()
         while not until():
             assert time.monotonic() < deadline
@@ -68,7 +68,7 @@ class Served:
         self.spin(lambda: self.received and self.received[-1] == str(word))
 
     def await_future(self):
-        """Start a coroutine; return the future for which it waits, and the list of its result."""
+        """Start a coroutine. Return the future that it awaits, and the list of its result."""
         future, done = Future(), []
 
         async def wait():
@@ -102,7 +102,7 @@ def served():
 
 
 @pytest.mark.slow
-def test_the_first_flood_moves_the_nodes_for_good_and_is_logged_with_what_it_costs(served, capfd):
+def test_the_first_flood_moves_the_nodes_for_good_and_is_logged(served, capfd):
     served.listen(seconds=1e-4)
     ticks = []
     served.node.create_timer(0.01, lambda: ticks.append(1))

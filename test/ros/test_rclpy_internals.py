@@ -1,8 +1,8 @@
-"""The internals of rclpy that `ros.rclpy_internals` relies on, if no other test fails without them.
+"""The internals of rclpy that `ros.rclpy_internals` relies on.
 
-If a test fails with a new release of rclpy, the function that it names must change. What receives or
-sends messages without an executor, notices them, runs timers or tasks, is tested by worlds in lockstep
-and the recorder.
+If a test fails with a new release of rclpy, the function that it names must change. There is none for
+what other tests fail without: worlds in lockstep and the recorder receive and send messages without an
+executor, notice them, and run timers and tasks.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ def spin(executor, until):
 
 
 def test_rcl_errors_have_their_place_in_the_sources(ros):
-    node = ros.add(Node, node_name='remapped', cli_args=['--ros-args', '-r', f'odom:={300 * "a"}'])
+    arguments = ['--ros-args', '-r', f'odom:={300 * "a"}']
+    node = ros.add(Node, node_name='remapped', cli_args=arguments)
     with pytest.raises(internals.RCLError, match=', at /') as caught:
         node.create_publisher(String, 'odom', 1)
     assert isinstance(caught.value, RuntimeError)
@@ -119,7 +120,8 @@ def test_clock_callback_is_wrapped_also_later(ros):
 
 def test_service_callback_is_wrapped(ros):
     calls = []
-    internals.wrap_service_callback(ros.add(Node, node_name='served'), GetParameters, recorder(calls))
+    node = ros.add(Node, node_name='served')
+    internals.wrap_service_callback(node, GetParameters, recorder(calls))
     client = ros.peer.create_client(GetParameters, 'served/get_parameters')
     ros.until(client.service_is_ready, 'the service')
     future = client.call_async(GetParameters.Request(names=['use_sim_time']))
@@ -130,7 +132,8 @@ def test_service_callback_is_wrapped(ros):
 
 def test_every_response_to_a_request_is_counted(ros):
     for name in ('one', 'two'):
-        ros.add(Node, node_name=name).create_service(SetBool, 'shared', lambda _, response: response)
+        node = ros.add(Node, node_name=name)
+        node.create_service(SetBool, 'shared', lambda _, response: response)
     client = ros.peer.create_client(SetBool, 'shared')
     ros.until(lambda: ros.peer.count_services('shared') == 2, 'both servers are discovered')
     responses = []
@@ -166,7 +169,7 @@ def test_sleep_is_wrapped_once_and_called_by_sleep_for():
         (internals.change_timer_period, 0.5, 2.0, 0.5),
     ],
 )
-def test_a_timer_is_restarted_or_keeps_an_earlier_expiry(lockstep, change, elapsed, period, first):
+def test_a_timer_restarts_or_expires_earlier(lockstep, change, elapsed, period, first):
     expired = []
     timer = lockstep.node.create_timer(1.0, lambda: expired.append(lockstep.now))
     lockstep.run_for(elapsed)
@@ -225,7 +228,7 @@ def test_a_line_is_logged_with_the_place_of_the_caller(node, monkeypatch, capfd)
 
 def test_events_executor_runs_a_task_after_the_queued_events(events, node):
     order = []
-    node.create_subscription(String, 'words', lambda message: order.append(message.data), 10)
+    node.create_subscription(String, 'words', lambda word: order.append(word.data), 10)
     publisher = node.create_publisher(String, 'words', 10)
     events.add_node(node)
     spin(events, events.create_task(lambda: None).done)

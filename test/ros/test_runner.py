@@ -173,7 +173,8 @@ def test_names_of_the_greatest_length_are_accepted():
 @pytest.mark.parametrize('domain', ['233', '٣'])
 def test_domains_that_do_not_exist_are_named(monkeypatch, domain):
     monkeypatch.setenv('ROS_DOMAIN_ID', domain)
-    with pytest.raises(UserError, match=f'must be in 0 to 232, got {domain!r}'), ros_context(['test']):
+    words = f'must be in 0 to 232, got {domain!r}'
+    with pytest.raises(UserError, match=words), ros_context(['test']):
         pass
 
 

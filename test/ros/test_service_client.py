@@ -38,7 +38,12 @@ def client(lockstep, server):
         return lockstep.world_time / 1e9
 
     found = ServiceClient(
-        lockstep.node, Trigger, 'serve', patience=PATIENCE, server='/server', monotonic=world_time
+        lockstep.node,
+        Trigger,
+        'serve',
+        patience=PATIENCE,
+        server='/server',
+        monotonic=world_time,
     )
     found.ends = []
 

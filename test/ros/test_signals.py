@@ -32,7 +32,10 @@ lock.acquire()
 @pytest.mark.process
 def test_a_second_signal_ends_a_process_that_hangs():
     child = subprocess.Popen(
-        [sys.executable, '-c', HUNG], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, '-c', HUNG],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert child.stdout.readline() == 'hangs\n'
     timer = threading.Timer(60.0, child.kill)
