@@ -41,10 +41,9 @@ def answering(world, name, answer=None):
 @pytest.fixture(scope='class')
 def talking():
     names = ('echo', 'bare', 'kept', 'late', 'hearing', 'waiting', 'repeater', 'best_effort')
-    asking = ('caller', 'asking', 'askingfirst')
-    with Lockstep() as world, answering(world, 'askingfirst/ask'):
+    with Lockstep() as world:
         world.start(
-            [*command(*names, *asking), '--ros-args', '-p', 'times:=3'],
+            [*command(*names, 'caller', 'asking'), '--ros-args', '-p', 'times:=3'],
             clock_period=1.0,
             without=['/kept/out'],
         )
@@ -108,9 +107,6 @@ class TestMessages:
         with answering(talking, 'caller/ask'):
             send(talking, 'caller', 0.0, 0.0, 0.0)
         assert numbers(received) == [1.0, 2.0, 3.0]
-        # While the process starts, too.
-        first = talking.listen(String, 'askingfirst/first', latched=True)
-        assert [one.data for one in first] == ['1']
 
     def test_a_callback_waits_for_a_service_of_the_world(self, talking):
         """What else is sent to it meanwhile comes after the response, as do later times."""
@@ -142,6 +138,13 @@ class TestMessages:
             talking.run_for(0.1)
         assert numbers(received) == [-1.0, -1.0]
         assert [stamp(one) for one in received] == [begin, begin]
+
+
+def test_a_process_calls_a_service_while_it_starts(lockstep):
+    with answering(lockstep, 'askingfirst/ask'):
+        lockstep.start(command('askingfirst'))
+    first = lockstep.listen(String, 'askingfirst/first', latched=True)
+    assert [one.data for one in first] == ['1']
 
 
 def test_an_action_of_a_process(lockstep):
