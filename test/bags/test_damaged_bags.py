@@ -108,7 +108,7 @@ HARMLESS = {'version', 'duration', 'message_count', 'compression_format', 'files
 """Some values of these are read."""
 
 
-def test_an_invalid_value_is_an_error_or_changes_nothing_and_is_recovered_from(whole, tmp_path):
+def test_an_invalid_value_is_an_error_or_changes_nothing(whole, tmp_path):
     changes = [(key, value) for key, values in INVALID.items() for value in values]
     changes += [(*TOPIC, key, value) for key, values in INVALID_TOPIC.items() for value in values]
     changes += [(*TOPIC, ABSENT), (TOPICS, 0, 'message_count', -3)]
@@ -276,7 +276,7 @@ def test_parameters_that_are_none_are_left_out_by_recover_run(tmp_path):
         assert read_run(recovery.bag).parameters == {'/other': {'kp': 3.0}}
 
 
-def test_parameters_of_another_kind_or_beyond_all_measure_are_as_if_absent(tmp_path):
+def test_invalid_parameters_are_as_if_absent(tmp_path):
     sent = [
         (1.0, '/goal_pose', goal(1.0, 0.5)),
         (1.0, '/joint_states', joint_command(1, 2)),
@@ -333,7 +333,7 @@ def test_recover_run_says_what_it_did_not_check(tmp_path):
 # --- What the message about an unreadable bag says
 
 
-def test_the_error_names_recover_run_only_where_there_may_be_something_to_save(bag, tmp_path):
+def test_recover_run_is_named_where_something_may_be_saved(bag, tmp_path):
     file = data_file(bag)
     file.write_bytes(file.read_bytes()[:-5000])
     journal = write_records(tmp_path / 'my crash', Text('storage', 'mcap'))

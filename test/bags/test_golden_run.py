@@ -182,7 +182,7 @@ def test_a_golden_run_is_replaced_only_if_the_run_differs(golden):
     golden(0.0, 2.0).check()
 
 
-def test_a_golden_run_that_cannot_be_read_is_reported_and_can_be_replaced(golden):
+def test_an_unreadable_golden_run_is_reported_and_replaced(golden):
     run = golden(0.0, update=True)
     run.check()
     data = data_file(run.path)

@@ -120,7 +120,7 @@ def test_files_that_are_copied_or_missing_are_reported(run, tmp_path, capsys):
     assert 'lost: metadata.yaml counts 70 messages, 50 were found' in out
 
 
-def test_what_sqlite_had_committed_to_its_log_is_saved_and_the_rest_rolled_back(run, tmp_path, capsys):
+def test_logs_of_sqlite_are_applied_or_rolled_back(run, tmp_path, capsys):
     file = write_without_metadata(run, 'sqlite3')
     with closing(sqlite3.connect(file)) as database:
         database.execute('PRAGMA cache_size = 1')
@@ -304,7 +304,7 @@ def test_wrong_counts_are_noticed_without_checksums(run, tmp_path, capsys):
 # --- What is refused
 
 
-def test_what_holds_nothing_of_a_bag_and_places_that_cannot_be_written(run, tmp_path, capsys):
+def test_what_is_no_bag_or_cannot_be_written_is_refused(run, tmp_path, capsys):
     for name in ('other', 'others'):
         (tmp_path / name).mkdir()
     (tmp_path / 'other' / 'notes.txt').write_text('no bag')
