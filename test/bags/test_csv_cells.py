@@ -17,7 +17,7 @@ HEADER = re.compile(r'[a-z][A-Za-z0-9_]*')
 FORMULAS = ('=cmd|" /C calc"!A0', '+1+1', '-2+3', '@SUM(A1)', '\t=1', '"\n=1')
 
 
-def test_names_of_joints_and_frames_are_not_in_the_table_of_a_run(tmp_path):
+def test_names_are_not_in_the_table_of_a_run(tmp_path):
     left, right, world, body, wheels_frame, goal_frame = FORMULAS
     wheels = joint_command(1.0, -1.0, SECOND)
     wheels.name, wheels.header.frame_id = [left, right], wheels_frame

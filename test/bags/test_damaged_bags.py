@@ -192,7 +192,7 @@ def test_another_number_of_messages_is_noted(bag, told):
     assert len(read_run(recovery.bag).odometry) == len(run.odometry) == COUNT
 
 
-def test_qos_that_differs_between_metadata_and_file_hides_no_messages(bag):
+def test_qos_that_differs_from_the_file_hides_no_messages(bag):
     """rosbags takes such topics for two and reads nothing, without a word."""
     profile = {
         **{'history': 'keep_last', 'depth': 10, 'reliability': 'reliable', 'durability': 'volatile'},

@@ -346,9 +346,7 @@ def test_a_start_that_does_not_fit_the_odometry_is_a_difference(lockstep, robot_
         assert not verify(replace(run, **changes)).agrees(EXACT, EXACT), changes
 
 
-def test_after_a_reset_of_the_odometry_alone_the_truth_has_no_known_start(
-    lockstep, robot_at, recording, command
-):
+def test_after_a_reset_of_odometry_the_truth_has_no_known_start(lockstep, robot_at, recording, command):
     robot_at(simulate_slip=True, cmd_vel_timeout=0.1)
     command(0.3, -0.7, 0.5)
     lockstep.call(Trigger, 'reset_odometry')
@@ -362,7 +360,7 @@ def test_after_a_reset_of_the_odometry_alone_the_truth_has_no_known_start(
 
 
 @pytest.mark.parametrize('missed', [1, 10])
-def test_a_recorder_that_missed_the_first_commands_does_not_blame_the_robot(run, missed):
+def test_missed_first_commands_do_not_blame_the_robot(run, missed):
     found = verified(kept(run, cmd_vel_out=slice(missed, None)))
     assert any('moved before the first command that was recorded' in note for note in found.notes)
     assert found.start == 'odometry'
