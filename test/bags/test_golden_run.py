@@ -105,7 +105,7 @@ def test_random_identifiers_are_compared_by_what_they_identify():
 
 
 class Recorded:
-    """A recorded run with a bag of /cmd_vel and /other, instead of one of a test."""
+    """A recorded run with a bag of two topics."""
 
     def __init__(self, bag, *speeds, other=0.0, topic='/cmd_vel'):
         sent = [(number / 50, topic, twist(v, 0.0)) for number, v in enumerate(speeds)]

@@ -52,7 +52,8 @@ def test_remains_of_killed_processes_are_removed(tmp_path):
             assert second != scratch
         assert scratch.exists()
     os.close(running)
-    # What is being written, has the bag that was replaced, is about to be locked, or is another's stays.
+    # What stays is being written, has the bag that was replaced,
+    # is about to be locked, or is of another bag.
     removed = made['one'], made['two']
     kept = {path for path in before if not any(path.is_relative_to(one) for one in removed)}
     assert set(tmp_path.rglob('*')) == kept
