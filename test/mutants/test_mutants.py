@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import os
 from dataclasses import replace
+from pathlib import Path
 
-import mutants
 import pytest
 from mutation import Mutant, Statements, mutated
+from support.processes import run_python
 
 LAW = '''
 GAIN: float = 2.0
@@ -28,45 +30,49 @@ from laws.law import speed
 def test_speed():
     assert speed(1.0) == 2.0
 
-def test_half_of_the_speed():
+def test_half():
     assert speed(0.5) == 1.0
 """
 
 
-@pytest.fixture
-def run(tmp_path, monkeypatch):
-    """What becomes of a mutant of another package if some tests execute its last line."""
+RUN = """
+import sys
+from pathlib import Path
+
+import mutants
+from mutation import Mutant
+
+mutants.ROOT, mutants.SOURCE = Path.cwd(), Path('toy').absolute()
+mutants.GRACE, mutants.SLOWER = 0.3, 1.0
+sys.path.insert(0, str(mutants.SOURCE))
+for mutant, tests in eval(sys.argv[1]):
+    names = [f'test/test_speed.py::{name}' for name in tests]
+    coverage = mutants.Coverage(cpu=dict.fromkeys(names, 0.1), lines={'laws/law.py': {9: names}})
+    ((_, outcome),) = mutants.run_mutants([mutant], coverage, 1)
+    print(outcome.result, outcome.by)
+"""
+
+
+@pytest.mark.process
+def test_a_mutant_is_killed_by_the_test_that_notices_it_and_survives_without(tmp_path):
+    """In a process of its own: it forks, which one that has run nodes must not do."""
     (tmp_path / 'toy' / 'laws').mkdir(parents=True)
     (tmp_path / 'toy' / 'laws' / 'law.py').write_text(LAW)
     (tmp_path / 'test').mkdir()
     (tmp_path / 'test' / 'test_speed.py').write_text(TESTS)
-    monkeypatch.setattr(mutants, 'ROOT', tmp_path)
-    monkeypatch.setattr(mutants, 'SOURCE', tmp_path / 'toy')
-    monkeypatch.syspath_prepend(tmp_path / 'toy')
-
-    def run(mutant, *tests):
-        names = [f'test/test_speed.py::{name}' for name in tests]
-        lines = {'laws/law.py': {9: names}}
-        coverage = mutants.Coverage(cpu=dict.fromkeys(names, 0.1), lines=lines)
-        ((_, outcome),) = mutants.run_mutants([mutant], coverage, 1)
-        return outcome
-
-    return run
-
-
-def test_a_mutant_is_killed_by_the_test_that_notices_it_and_survives_without(run):
-    both = run(SPEED, 'test_speed', 'test_half_of_the_speed')
-    assert both.result == 'killed'
-    assert both.by == 'test/test_speed.py::test_half_of_the_speed'
-    assert run(SPEED, 'test_speed').result == 'survived'
-    assert run(SPEED).result == 'untested'
-    assert run(replace(SPEED, statement='return distance'), 'test_speed').result == 'gone'
-
-
-def test_a_mutant_that_does_not_end_is_stopped(run, monkeypatch):
-    monkeypatch.setattr(mutants, 'GRACE', 0.3)
-    monkeypatch.setattr(mutants, 'SLOWER', 1.0)
-    assert run(replace(SPEED, mutant='while True:'), 'test_speed').result == 'timeout'
+    cases = {
+        'killed test/test_speed.py::test_half_of_the_speed': (
+            SPEED,
+            ['test_speed', 'test_half_of_the_speed'],
+        ),
+        'survived ': (SPEED, ['test_speed']),
+        'untested ': (SPEED, []),
+        'gone ': (replace(SPEED, statement='return distance'), ['test_speed']),
+        'timeout test/test_speed.py::test_speed': (replace(SPEED, mutant='while True:'), ['test_speed']),
+    }
+    path = {**os.environ, 'PYTHONPATH': str(Path(__file__).parent)}
+    ended = run_python(RUN, repr([*cases.values()]), cwd=tmp_path, env=path)
+    assert ended.stdout.splitlines() == [*cases], ended.stderr
 
 
 def test_a_statement_is_found_in_another_file_and_function_if_it_is_the_only_one():

@@ -78,7 +78,7 @@ def play(world, capfd):
 def test_commands_come_as_recorded_and_only_they(world, bag, play):
     received, told = world.harness.listen(Twist, 'cmd_vel'), world.harness.listen(Goals, 'goals')
     # Acknowledged before the usual heartbeat of three seconds.
-    code, out, _ = play(bag, '-r', '20', '-w', '1', '--wait-for-all-acked', '2900')
+    code, out, _ = play(bag, '-r', '20', '-w', '1', '--wait-for-all-acked', '2900', '--timeout', '60')
     assert code == 0
     assert out.splitlines()[-1] == f'{len(COMMANDS)} messages played'
     world.harness.until(lambda: len(received) == len(COMMANDS), 'all have come')
