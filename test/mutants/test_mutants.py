@@ -61,10 +61,7 @@ def test_a_mutant_is_killed_by_the_test_that_notices_it_and_survives_without(tmp
     (tmp_path / 'test').mkdir()
     (tmp_path / 'test' / 'test_speed.py').write_text(TESTS)
     cases = {
-        'killed test/test_speed.py::test_half_of_the_speed': (
-            SPEED,
-            ['test_speed', 'test_half_of_the_speed'],
-        ),
+        'killed test/test_speed.py::test_half': (SPEED, ['test_speed', 'test_half']),
         'survived ': (SPEED, ['test_speed']),
         'untested ': (SPEED, []),
         'gone ': (replace(SPEED, statement='return distance'), ['test_speed']),
