@@ -7,16 +7,19 @@ import math
 import os
 import subprocess
 import sys
+import time
 import warnings
 
 import pytest
-import rclpy
 from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from support.domains import domain_id
+from support.harness import PATIENCE
 from support.inner_sessions import draw_quickly, run_inner
 from support.ros_messages import twist
 
 from diffdrive_jacobian.faults import EncoderSteps, Kill
-from diffdrive_jacobian.ros.runner import DISCOVERY
+from diffdrive_jacobian.ros.runner import ros_context
 from diffdrive_jacobian.testing import Lockstep
 
 PLUGIN = 'diffdrive_jacobian.testing.fixtures'
@@ -168,20 +171,22 @@ def test_a_robot_has_its_pose_by_odometry_and_its_true_one(lockstep, robot_at):
     assert 1e-4 < math.dist(robot.pose[:2], robot.truth[:2]) < 0.03
 
 
-def test_a_world_is_isolated_whatever_the_environment(monkeypatch):
-    """ROS reads the environment when a context is initialized."""
-    for name in DISCOVERY:
-        monkeypatch.setenv(name, 'LOCALHOST')
-    found, init = [], rclpy.init
-
-    def initialize(**arguments):
-        found.append({name: os.environ[name] for name in DISCOVERY if name in os.environ})
-        init(**arguments)
-
-    monkeypatch.setattr(rclpy, 'init', initialize)
-    with Lockstep():
-        assert os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
-    assert found == [{'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}]
+def test_no_other_node_sees_those_of_a_world(monkeypatch):
+    """On one domain, also in one process, where nodes of two contexts see each other."""
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id()))
+    with Lockstep() as world, ros_context(['test']) as context, ros_context(['test']) as other:
+        world.node.create_publisher(Odometry, 'odom', 10)
+        observer = Node('observer', context=context)
+        later = Node('later', context=other)
+        later.create_publisher(Odometry, 'odom', 10)
+        deadline = time.monotonic() + PATIENCE
+        while observer.count_publishers('odom') == 0:
+            assert time.monotonic() < deadline
+        assert observer.count_publishers('odom') == 1
+        assert world.node.count_publishers('odom') == 1
+        for node in (observer, later):
+            node.destroy_node()
 
 
 # --- Reports
