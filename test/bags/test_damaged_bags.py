@@ -31,7 +31,7 @@ from diffdrive_jacobian.plots.run_lines import limits
 from diffdrive_jacobian.safe_yaml import load_yaml
 from diffdrive_jacobian.tools import plot_run, recover_run, replay_run
 
-pytestmark = pytest.mark.usefixtures('quick_disk')
+pytestmark = [pytest.mark.usefixtures('quick_disk'), pytest.mark.slow]
 
 COUNT = 10
 ODOMETRY = definition('nav_msgs/msg/Odometry')

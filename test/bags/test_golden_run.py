@@ -23,6 +23,9 @@ from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.testing.recorded_run import Comparison, GoldenRun, GoldenRunError
 
+pytestmark = pytest.mark.slow
+
+
 # --- Messages
 
 

@@ -14,6 +14,7 @@ from support.runs import STRAIGHT, run_of
 from diffdrive_jacobian.bags.summary import summary, table_of
 from diffdrive_jacobian.bags.timeline import timeline
 
+pytestmark = pytest.mark.slow
 ONE = goal(0.5, 0.0)
 ALONG = path((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 TOPICS = {

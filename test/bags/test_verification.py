@@ -36,6 +36,7 @@ from diffdrive_jacobian.simulation.robot_model import RobotModel
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
+pytestmark = pytest.mark.slow
 EXACT = 1e-9
 NOTHING = slice(0, 0)
 COUNT = 100

@@ -37,6 +37,7 @@ from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.plots import calibration_figure
 from diffdrive_jacobian.tools import calibrate_run
 
+pytestmark = pytest.mark.slow
 DIMENSIONS = {'/wheel_bridge': {'wheel_radius': 0.033, 'wheel_separation': 0.16}}
 
 

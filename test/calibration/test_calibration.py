@@ -35,6 +35,9 @@ from diffdrive_jacobian.calibration.motion import composed, increments, inverted
 from diffdrive_jacobian.calibration.preparation import overlapping
 from diffdrive_jacobian.kinematics.se2 import adjoint
 
+pytestmark = pytest.mark.slow
+
+
 # --- Estimate
 
 

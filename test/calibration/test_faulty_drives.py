@@ -23,6 +23,7 @@ from calibration_data import (
 
 from diffdrive_jacobian.calibration import CalibrationError, Given, calibrate, preparation
 
+pytestmark = pytest.mark.slow
 RECORDING = ROBOT.recording(np.random.default_rng(13))
 
 

@@ -21,6 +21,7 @@ from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loop, closed_loops, trajectories
 from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 
+pytestmark = pytest.mark.slow
 R, L = 0.033, 0.16
 MS = 1_000_000
 FREE = VelocityLimits()

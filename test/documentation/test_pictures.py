@@ -19,6 +19,7 @@ from diffdrive_jacobian import plots
 from diffdrive_jacobian.kinematics.spatial_arm import IIWA
 from diffdrive_jacobian.plots import arm_pictures, rendering, spatial_pictures
 
+pytestmark = pytest.mark.slow
 LARGEST = 100_000
 """Size of a picture (bytes)."""
 ROOT = Path(__file__).parents[2]
@@ -37,7 +38,6 @@ run = partial(commands.run, 'plot_jacobian')
 # --- The pictures
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('name', plots.PICTURES)
 def test_a_picture_is_whole_and_does_not_depend_on_the_style_of_the_user(name):
     with matplotlib.rc_context({'text.usetex': True, 'font.size': 40.0, 'lines.linewidth': 20.0}):

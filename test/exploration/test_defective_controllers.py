@@ -12,6 +12,7 @@ from diffdrive_jacobian.faults import Duplicate, Hang, Loss, TimeJump
 from diffdrive_jacobian.relations import Moved, Renamed, Repeated, Shifted, check_relation
 from diffdrive_jacobian.testing import Lockstep, PropertyViolation
 
+pytestmark = pytest.mark.slow
 QUIET = ('--ros-args', '--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
 WORLDS = {
     'no odometry timeout': (

@@ -25,6 +25,7 @@ from diffdrive_jacobian.testing import (
     numbers,
 )
 
+pytestmark = pytest.mark.slow
 SLOW = NeverFasterThan(0.75, 1.0)
 LOSSES = fault_schedules(['speed'], kinds=[Loss], max_faults=2, duration=1.2)
 SPEEDS = {'speed': numbers(0.0, 5.0)}

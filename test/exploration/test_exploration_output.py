@@ -20,6 +20,7 @@ from diffdrive_jacobian.plots.run_panels import VIOLATION
 from diffdrive_jacobian.properties import FieldWithin, NeverFasterThan, Property, StaysNear
 from diffdrive_jacobian.testing import Lockstep, SerialExecutor
 
+pytestmark = pytest.mark.slow
 TEST = 'test_no_exception_assertion_error.py'
 
 

@@ -16,6 +16,7 @@ from diffdrive_jacobian.properties import FieldWithin, NeverFasterThan
 from diffdrive_jacobian.relations import Mirrored, Moved, Relation, Repeated
 from diffdrive_jacobian.testing import fault_schedules, numbers
 
+pytestmark = pytest.mark.slow
 SPEEDS = {'speed': numbers(0.0, 5.0)}
 
 

@@ -32,6 +32,7 @@ from diffdrive_jacobian.testing import (
     waypoints,
 )
 
+pytestmark = pytest.mark.slow
 FEW = settings(max_examples=25, database=None, derandomize=True, deadline=None)
 SHRINK = settings(max_examples=60, database=None, derandomize=True)
 FIELDS = {'odom': ['pose.pose.position.x', 'header.stamp', 'header.frame_id']}

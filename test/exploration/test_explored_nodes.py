@@ -7,6 +7,8 @@ import related_nodes
 from exploration_scenarios import serial
 from explored_nodes import SCENARIOS, properties
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize('name', SCENARIOS)
 def test_nothing_is_found_in_our_nodes(name, tmp_path):

@@ -17,6 +17,7 @@ from diffdrive_jacobian.kinematics.spatial import (
 )
 from diffdrive_jacobian.kinematics.spatial_arm import IIWA, PANDA, UR5, SpatialArm
 
+pytestmark = pytest.mark.slow
 STANFORD = SpatialArm(
     a=0.0,
     alpha=[-np.pi / 2, np.pi / 2, 0.0, -np.pi / 2, np.pi / 2, 0.0],

@@ -21,6 +21,8 @@ from diffdrive_jacobian.messages.codecs import Changes
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.recording.recording import Recording
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):

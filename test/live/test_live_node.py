@@ -34,6 +34,8 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 
+pytestmark = pytest.mark.slow
+
 
 class Live:
     """An open page, and the node behind it."""

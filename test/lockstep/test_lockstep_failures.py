@@ -31,6 +31,8 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def impatient():

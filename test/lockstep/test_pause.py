@@ -18,6 +18,8 @@ from diffdrive_jacobian.properties import FieldWithin
 from diffdrive_jacobian.relations import Repeated, check_relation
 from diffdrive_jacobian.testing import Lockstep, LockstepError, PropertyViolation
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def stops(monkeypatch):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
 from support.inner_sessions import OPTIONS, SETTING, draw_quickly, run_inner
 
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.testing.fixtures import MAX_LENGTH, artifact_name, name_beside_the_file
 
+pytestmark = pytest.mark.slow
 RECORDED = """
     from support.inner_sessions import draw_quickly
 

@@ -35,6 +35,8 @@ from diffdrive_jacobian.ros.service_client import LONGEST_STEP, PENDING, Livenes
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.send_goal import report
 
+pytestmark = pytest.mark.slow
+
 
 def add_client(ros, goals, **kwargs):
     def create(context, parameter_overrides):

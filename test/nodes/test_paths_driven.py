@@ -29,6 +29,8 @@ from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.drive_to import main
 
+pytestmark = pytest.mark.slow
+
 
 def panels(run):
     return [axes.get_title(loc='left') for axes in run_figure(run).axes]

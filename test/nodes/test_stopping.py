@@ -19,6 +19,7 @@ from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.actuators import AccelerationLimits, Actuators, AxisLimits
 from diffdrive_jacobian.simulation.braking import Braking
 
+pytestmark = pytest.mark.slow
 SLOW = {'linear.x.max_acceleration': 0.4, 'linear.x.max_deceleration': -0.1}
 ACTUATORS = Actuators(
     acceleration=AccelerationLimits(

@@ -43,6 +43,8 @@ from diffdrive_jacobian.properties import (
 )
 from diffdrive_jacobian.testing import Lockstep, PropertyViolation
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def scene(lockstep):

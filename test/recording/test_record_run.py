@@ -31,6 +31,7 @@ from diffdrive_jacobian.ros.runner import discovery_off
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import record_run
 
+pytestmark = pytest.mark.slow
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 

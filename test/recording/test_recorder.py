@@ -22,6 +22,7 @@ from diffdrive_jacobian.recording.recorder import Recorder, Selection
 from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage
 from diffdrive_jacobian.ros.runner import ros_context
 
+pytestmark = pytest.mark.slow
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 LATCHED = {'depth': 3, 'durability': DurabilityPolicy.TRANSIENT_LOCAL}
 DEPTH = 100

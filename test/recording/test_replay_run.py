@@ -24,6 +24,7 @@ from diffdrive_jacobian.recording.replaying import Playback, Replayer, ReplayPro
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import replay_run
 
+pytestmark = pytest.mark.slow
 FAST = ('-r', '50')
 ACKED = ('--wait-for-all-acked', '20000')
 """A reader may find the publisher later than the publisher finds the reader."""

@@ -50,6 +50,7 @@ from diffdrive_jacobian.relations.checking import (
 from diffdrive_jacobian.relations.worlds import Scene, decoded
 from diffdrive_jacobian.testing import LockstepError, PropertyViolation
 
+pytestmark = pytest.mark.slow
 QUIET = ('--ros-args', '--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
 
 

@@ -33,6 +33,7 @@ from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.tools import _output
 
+pytestmark = pytest.mark.slow
 QUICK = {'kp': 12.0, 'kv': 3.0}
 # Integers are taken for doubles.
 QUICK_ARGUMENTS = ('--ros-args', '-p', 'kp:=12', '-p', 'kv:=3')

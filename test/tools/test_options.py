@@ -33,6 +33,8 @@ from diffdrive_jacobian.recording.recording import open_recording
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.tools import _output
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_configurations_of_an_installation_are_found(tmp_path, monkeypatch):
     folder = tmp_path / 'share' / 'diffdrive_jacobian' / 'config'

@@ -22,6 +22,8 @@ from diffdrive_jacobian.plots.run_panels import COMMAND, LABELS, fault_label
 from diffdrive_jacobian.plots.run_pictures import COLORS
 from diffdrive_jacobian.plots.run_plane import ARROWS, PLANNED
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):

@@ -38,6 +38,7 @@ from diffdrive_jacobian.simulation import (
 from diffdrive_jacobian.simulation.gain_sweep import MEASURES, columns
 from diffdrive_jacobian.tools import _output, sweep_gains
 
+pytestmark = pytest.mark.slow
 CONFIG = Path(__file__).parents[2] / 'config'
 LIMITS = VelocityLimits(min_v=-0.306, max_v=0.306, min_omega=-1.9, max_omega=1.9, max_wheel_speed=8.559)
 """Those of config/create3.yaml."""
