@@ -162,8 +162,8 @@ def test_a_debugger_is_noticed_while_it_follows(monkeypatch):
 def test_a_process_may_take_its_time(lockstep, stops):
     """As one that a debugger stops. Without a pause that is an error."""
     program = [sys.executable, str(Path(__file__).with_name('external_nodes.py')), 'echo']
-    process = lockstep.start(program, patience=1.0)
     lockstep.pause_at(0.1)
+    process = lockstep.start(program, patience=1.0)
     process.signal(signal.SIGSTOP)
     goes_on = threading.Timer(2.5, process.signal, [signal.SIGCONT])
     goes_on.start()
