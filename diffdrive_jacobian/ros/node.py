@@ -239,7 +239,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
     def _apply_parameters(self, changes: list[Parameter]) -> None:
         previous = self.parameters
         self.parameters = new = previous.changed({one.name: one.value for one in changes})
-        if new == previous:
+        # By their values: since Python 3.13 a dataclass with a NaN does not equal a copy of itself.
+        if new.by_name() == previous.by_name():
             return
         self.parameters = with_overrides(self, previous, new)
         # For each that a controller has added rclpy calls this again, with the value that it has.

@@ -29,16 +29,20 @@ announce_frequently()
 _numbers = itertools.count()
 
 
+def python(program, *arguments):
+    """Return the command `python -c PROGRAM ARGUMENTS`."""
+    return [sys.executable, '-c', program, *map(str, arguments)]
+
+
 def start_python(program, *arguments, **streams):
     """Start `python -c PROGRAM ARGUMENTS`."""
-    command = [sys.executable, '-c', program, *map(str, arguments)]
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL, **streams)
+    return subprocess.Popen(python(program, *arguments), stdin=subprocess.DEVNULL, **streams)
 
 
 def run_python(program, *arguments, timeout=LIMIT, **options):
     """Run `python -c PROGRAM ARGUMENTS` to its end; return its exit code and what it printed."""
     streams = {'stdin': subprocess.DEVNULL, 'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE}
-    command = [sys.executable, '-c', program, *map(str, arguments)]
+    command = python(program, *arguments)
     return subprocess.run(command, **{**streams, **options}, text=True, timeout=timeout)
 
 
@@ -129,12 +133,6 @@ class World:
         """Start an entry point with arguments. What goes into a given `stdout` is not seen."""
         child = Child(name, arguments, self._directory, stdout)
         self._children.append(child)
-        return child
-
-    def run(self, name, *arguments):
-        """Start an entry point and wait for its end."""
-        child = self.start(name, *arguments)
-        child.exit()
         return child
 
     @cached_property
