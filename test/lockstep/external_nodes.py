@@ -308,8 +308,9 @@ def main(arguments):
         executor.add_node(node)
     spin(executor)
     if 'polite' in arguments:
-        # A last message.
+        # A last message. If it ended at once, its end might be discovered before that is received.
         nodes[0].send(-9.0)
+        time.sleep(0.5)
 
 
 if __name__ == '__main__':

@@ -153,7 +153,11 @@ class Exchange:
             if discovery.services_changed:
                 self._offer_called()
             waiting.refuse(waiting.take())
-            send()
+            try:
+                send()
+            except LockstepError:
+                waiting.check_lost(now=True)
+                raise
             waiting.wait()
             if domain.wall_time is not None:
                 domain.wall_time.check(domain.title)

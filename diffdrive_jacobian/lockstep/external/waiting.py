@@ -106,7 +106,6 @@ class Waiting:
         try:
             return [*(arrived for relay in relays for arrived in relay.take()), *calls]
         except LockstepError:
-            # Datagrams that the system has counted as lost are the cause, and have another remedy.
             self.check_lost(now=True)
             raise
 
@@ -128,6 +127,8 @@ class Waiting:
 
     def check_lost(self, *, now: bool = False) -> None:
         """Raise LockstepError if messages between the world and the process are known to be lost.
+
+        They are the cause of other errors, and this one has the remedy.
 
         Args:
             now: Whether to look, even if that was done just before.
