@@ -75,6 +75,8 @@ def test_a_braked_robot_comes_to_rest_within_the_room_wherever_it_is_stopped(lag
             braking.sent(stamp, (v, omega))
             stamp += PERIOD
             robot = robot.commanded((v, omega), robot.stamp).at(stamp)
+            if number % 3:
+                continue
             distance, turned = travelled(stopped(robot))
             assert distance <= room + 1e-9
             assert abs(turned) <= turn + 1e-9
