@@ -124,6 +124,13 @@ def test_an_invalid_value_is_an_error_or_changes_nothing(whole, tmp_path):
     assert read <= HARMLESS | {'type_description_hash'}
 
 
+@pytest.mark.parametrize(('key', 'value'), [('name', ''), ('type', 3)])
+def test_names_of_topics_and_types_must_be_text(bag, key, value):
+    edit(bag, *TOPIC, key, value)
+    with pytest.raises(DamagedBagError, match=f'the {key} of a topic must be text .*, got {value!r}'):
+        read_run(bag)
+
+
 @pytest.mark.parametrize('text', ['', '[1, 2', '\0', 'x', 'x: !!y z', f'{KEY}: 3', '[[' * 1500])
 def test_metadata_that_is_no_map_or_too_deep_is_damage(whole, tmp_path, text):
     bag = shutil.copytree(whole['mcap'], tmp_path / 'bag')

@@ -9,6 +9,7 @@ import pytest
 from geometry_msgs.msg import Twist, Vector3
 from std_msgs.msg import String
 from support.bags import write_bag
+from support.ros_messages import goal
 from support.runs import run_of, sample
 
 from diffdrive_jacobian.bags.run import read_run
@@ -16,7 +17,7 @@ from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.faults import Push, TimeJump
 from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.plots.run_lines import commanded, measured
-from diffdrive_jacobian.plots.run_panels import NAMED, fault_spans
+from diffdrive_jacobian.plots.run_panels import NAMED, ViolationMark, fault_spans
 from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
 
@@ -51,6 +52,12 @@ def test_faults_are_bands_over_time_and_many_are_counted(tmp_path):
     assert not plane.patches
     for panel in panels:
         assert [patch.get_x() for patch in panel.patches] == pytest.approx([1.0, 2.0])
+    # Times count from the goal, also those of violations.
+    (tmp_path / 'goal').mkdir()
+    begun = run_of(tmp_path / 'goal', [*events, (10.5, '/goal_pose', goal(3.0, 0.0))])
+    violated = run_figure(begun, [ViolationMark(round(11.5e9), 'Reaches(3)')])
+    words = {text.get_text() for legend in violated.legends for text in legend.get_texts()}
+    assert {f'0.5 to 1.0 s: {loss}', '1.0 s: Reaches(3)'} <= words
     # Several runs are compared without them.
     assert labels(run_figure([run, run])) == []
     # Long ones stay in the picture.

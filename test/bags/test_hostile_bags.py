@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import struct
+import zlib
 from contextlib import suppress
 
 import pytest
 from hostile_bags import (
+    MAGIC,
     chunk,
     mcap,
     message,
+    record,
+    text,
     topic_records,
     write_folder,
 )
@@ -24,6 +29,7 @@ from diffdrive_jacobian.bags import BagError, NotABagError, read_run
 from diffdrive_jacobian.bags import recover as write_recovered
 from diffdrive_jacobian.bags.bag_reader import find_damage, open_bag
 from diffdrive_jacobian.bags.corrected_reader import CorrectedReader
+from diffdrive_jacobian.bags.salvage import read_mcap
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.file import robot_parameters
 
@@ -221,3 +227,19 @@ def test_many_losses_are_counted(file, capsys):
     assert (code, contents(file.parent)) == (1, before)
     assert len(err.splitlines()) < 60
     assert err.splitlines()[-1].startswith('... and 1')
+
+
+def test_a_count_of_a_topic_that_is_not_there_is_noticed():
+    body = topic_records() + message(b'\0\1\0\0' + bytes(8))
+    data = MAGIC + record(1, text('ros2') + text('test')) + chunk('', body, len(body), zlib.crc32(body))
+    summary = len(data := data + record(15, bytes(4)))
+    for counts, noticed in (
+        ({1: 1}, []),
+        ({1: 1, 2: 100}, ['its statistics count 101 messages, 1 wer']),
+    ):
+        pairs = b''.join(struct.pack('<HQ', *one) for one in counts.items())
+        statistics = struct.pack('<QHIIIIQQ', sum(counts.values()), 1, 2, 0, 0, 1, 1, 1) + text(pairs)
+        end = record(11, statistics) + record(2, struct.pack('<QQI', summary, 0, 0)) + MAGIC
+        notes = []
+        assert [*read_mcap(io.BytesIO(data + end), notes.append, lambda doubt: None)]
+        assert [note[:40] for note in notes] == noticed

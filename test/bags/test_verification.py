@@ -31,10 +31,12 @@ from diffdrive_jacobian.messages.codecs import Changes
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.simulation.robot_model import RobotModel
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.testing.recorded_run import RecordedRun
+from diffdrive_jacobian.tools import verify_run
 
 pytestmark = pytest.mark.slow
 EXACT = 1e-9
@@ -444,6 +446,17 @@ def test_messages_that_are_missing_are_named(run, name, which, words):
     assert not found.holds(EXACT, EXACT)
     (missing,) = found.missing
     assert re.match(words, missing)
+
+
+def test_the_tool_fails_if_messages_are_missing(run, capsys, monkeypatch):
+    whole, part = run, kept(run, odometry=np.delete(np.arange(len(run.odometry)), 40))
+    for read, code, words in (
+        (whole, 0, 'moves as recorded'),
+        (part, 1, 'NOT verified: what was recorded'),
+    ):
+        monkeypatch.setattr(verify_run, 'read_run', lambda *_, read=read, **__: read)
+        assert verify_run.main(['run'], Signals()) == code
+        assert words in capsys.readouterr().out
 
 
 def test_messages_that_were_skipped_or_lost_are_missing(run):

@@ -217,3 +217,13 @@ def test_laws_of_paths_are_no_laws_of_goals_and_look_ahead_by_a_gain():
         find_controller('kanayama')
     with pytest.raises(ValueError, match="lookahead must be '' or one of kp, kv, got 'l'"):
         PathController(name='mine', law=lambda *_: (0.0, 0.0), lookahead='l')
+
+
+@pytest.mark.parametrize('turn', [math.pi, -3.0, 3.0 * math.pi])
+def test_a_path_is_followed_across_a_heading_of_pi(turn):
+    """The robot has the heading 3.1, and so drives, and does not turn in place first."""
+    ahead = [[0.0, 0.0, turn], [-2.0, 2.0 * -math.tan(turn), turn]]
+    for law in PATH_CONTROLLERS:
+        driven = follow_path(law, Path(np.array(ahead)), start=[0.0, 0.02, 3.1], timeout=30.0)
+        assert driven.finished, law
+        assert driven.times[-1] < 13.0, law

@@ -112,6 +112,14 @@ def test_kinds_of_faults_that_are_none_are_named(install, tmp_path, monkeypatch,
         fault_schedules(nodes=['driver'], kinds=[DeadWheel])
 
 
+def test_an_entry_point_of_another_group_is_another_one(monkeypatch):
+    kinds, pictures = extensions.FAULT_KINDS, extensions.PICTURES
+    both = (('KINDS', kinds), ('draw', pictures))
+    ours = EntryPoints(EntryPoint('arm', f'test_extensions:{one}', group) for one, group in both)
+    monkeypatch.setattr(extensions, 'entry_points', lambda **wanted: ours.select(**wanted))
+    assert extensions.load(kinds, 'arm').keys() == KINDS.keys()
+
+
 def test_two_entry_points_of_one_name_are_refused(install):
     install('fault_kinds', 'arm = test_extensions:KINDS', 'arm = other:KINDS')
     words = 'several distributions have an entry point arm of .*: other:KINDS, test_extensions:KINDS'

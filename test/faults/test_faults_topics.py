@@ -7,7 +7,9 @@ from itertools import pairwise
 
 import pytest
 from faults_nodes import LATCHED, Sink, Source, in_time, play
+from rclpy.node import Node
 from std_msgs.msg import Int64, String
+from support.lockstep_nodes import LEAN
 
 from diffdrive_jacobian import faults
 from diffdrive_jacobian.bags.bag_reader import open_bag
@@ -48,6 +50,23 @@ PLAYED = {
 def test_messages_arrive(lockstep, how):
     injected, expected = PLAYED[how]
     assert play(lockstep, *injected) == expected
+
+
+def test_a_copy_comes_before_what_was_published_later(lockstep):
+    source, got = lockstep.create(lambda: Node('source', **LEAN)), []
+    sink = lockstep.create(lambda: Node('sink', **LEAN))
+    publishers = [source.create_publisher(Int64, topic, 10) for topic in 'ab']
+    for topic in 'ab':
+        sink.create_subscription(Int64, topic, lambda _, topic=topic: got.append(topic), 10)
+    lockstep.inject(faults.Duplicate('a'))
+
+    def publish():
+        for publisher in publishers:
+            publisher.publish(Int64())
+
+    source.create_timer(0.1, publish)
+    lockstep.run_for(0.25)
+    assert ''.join(got) == 'aab' * 2
 
 
 # --- Random numbers

@@ -148,7 +148,7 @@ def test_a_port_in_use_is_named(tmp_path, monkeypatch):
         port = taken.getsockname()[1]
         for command in (('watch_run',), ('drive_to', '--live')):
             message = commands.refused(*command, '--no-browser', '--port', port, code=1)
-            assert f'--port {port} is in use' in message
+            assert f'--port {port} is in use: choose another one' in message
     assert list(tmp_path.iterdir()) == []
 
 

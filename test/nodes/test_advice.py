@@ -94,6 +94,19 @@ def test_the_advice_is_given_where_a_robot_overshoots():
     assert not overshoot_warnings(0.5, None, fast, Actuators())
 
 
+@pytest.mark.parametrize('side', [1.0, -1.0])
+def test_turns_are_overshot_in_the_direction_that_is_faster(side):
+    slowing = AxisLimits(max_acceleration=1.0, max_deceleration=-1.0, max_deceleration_reverse=1.0)
+    actuators = Actuators(acceleration=AccelerationLimits(omega=slowing))
+    lower, upper = sorted([-8.0 * side, 0.5 * side])
+    (warning,) = overshoot_warnings(
+        None, 3.0, VelocityLimits(min_omega=lower, max_omega=upper), actuators
+    )
+    assert 'choose kp below 0.25,' in warning
+    slower = VelocityLimits(min_omega=-0.5, max_omega=0.5)
+    assert overshoot_warnings(None, 3.0, slower, actuators) == []
+
+
 def test_how_far_a_robot_rolls_on_is_described_where_it_is_known():
     actuators = Actuators(
         acceleration=AccelerationLimits(v=AxisLimits(max_acceleration=0.4, max_deceleration=-0.1)),

@@ -73,6 +73,10 @@ def test_cancel_sends_zero_and_there_must_be_a_goal(lockstep, controller):
     assert twists(controller.commands) == [(0.5, 0.0), (0.0, 0.0)]
     assert controller.statuses == [(1, ACCEPTED), (1, EXECUTING), (1, CANCELED)]
     assert cancel() == (False, 'no goal is active')
+    # Also if nobody knows whether the robot stands.
+    controller.send(goal(1, 0, stamp=2))
+    assert cancel() == (True, 'goal canceled, zero sent')
+    assert twists(controller.commands)[2:] == [(0.0, 0.0)]
     assert controller.sees(odometry(0, 0, 0)) == []
 
 

@@ -186,3 +186,13 @@ def test_one_goal_and_waypoints_where_the_robot_is_have_no_path():
     for places in ([(1, 0)], [(0, 0), (0, 0)]):
         assert steer.begin(Pursuit.of(goal(*places)), (0.0, 0.0, 0.0)).follower is None
     assert steer.begin(Pursuit.of(goal((1, 0), (2, 1))), (0.0, 0.0, 0.0)).follower.passing
+
+
+def test_it_brakes_for_the_goal_only_if_it_is_to_stop_in_time():
+    limits = {'linear_x_max_acceleration': 0.1, 'linear_x_max_deceleration': -0.1, 'kv': 2.0}
+    # At 0.2 m/s it needs the 0.2 m that are left.
+    near = at(0.8, 0, twist=(0.2, 0.0))
+    assert command(steering(**limits), goal((1, 0)), near) == (pytest.approx(0.4), 0.0)
+    assert command(steering(**limits, stop_in_time=True), goal((1, 0)), near) == (0.0, 0.0)
+    # A robot without limits stops at once.
+    assert command(steering(kv=2.0, stop_in_time=True), goal((1, 0)), near) == (pytest.approx(0.4), 0.0)

@@ -11,6 +11,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from geometry_msgs.msg import Twist
+from rclpy.parameter import Parameter
 from support.commands import refused, run
 from support.lockstep_nodes import make_complete
 from support.recorded import LockstepRecording
@@ -228,13 +229,16 @@ def test_a_controller_that_ignores_the_heading(values, ignored):
     assert ignores_heading(values) == ignored
 
 
-@pytest.mark.parametrize(('matters', 'follow'), [(True, True), (True, False), (False, True)])
-def test_a_heading_that_is_ignored_is_reported_if_it_matters(matters, follow):
-    progress = Mock()
+@pytest.mark.parametrize(
+    ('matters', 'follow', 'used'),
+    [(True, True, False), (True, False, False), (False, True, False), (True, True, True)],
+)
+def test_a_heading_that_is_ignored_is_reported_if_it_matters(matters, follow, used):
+    progress, given = Mock(), [Parameter('use_goal_heading', value=used)]
     with in_lockstep() as runner:
-        runner.add(lambda: GoToGoal(context=runner.context))
+        runner.add(lambda: GoToGoal(context=runner.context, parameter_overrides=given))
         how = {'follow': follow, 'heading_matters': matters, 'timeout': 1.0, 'progress': progress}
         send_goal([1.0, 0.0, 1.5], runner=runner, **how)
-    assert progress.heading_ignored.called == matters
+    assert progress.heading_ignored.called == (matters and not used)
     waiting = {call.args for call in progress.waiting.call_args_list}
     assert (('no odometry on /odom',) in waiting) == follow
