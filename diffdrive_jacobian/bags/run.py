@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ from diffdrive_jacobian.bags.bag_reader import (
 )
 from diffdrive_jacobian.bags.decoded import read_messages
 from diffdrive_jacobian.messages.codecs import Changes, FaultEvent
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import base_name, namespace_of
 from diffdrive_jacobian.messages.topics import READABLE, TABLES, Topic
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -215,21 +217,10 @@ def read_run(
             namespace.
     """
     path = Path(path)
-    rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = defaultdict(list)
-    changes: list[tuple[int, Changes]] = []
-    fault_events: list[tuple[int, FaultEvent]] = []
 
     def take(connection: Connection, received: int, value: Any) -> None:
-        table = chosen[connection.id].table
-        if isinstance(value, Changes):
-            if namespace in (None, namespace_of(value.node)):
-                changes.append((received, value))
-        elif isinstance(value, FaultEvent):
-            fault_events.append((received, value))
-        elif table is not None:
-            rows[table.series] += [
-                (received, stamp or received, row) for stamp, row in table.rows(value, names)
-            ]
+        if not isinstance(value, Changes) or namespace in (None, namespace_of(value.node)):
+            gathered.take(chosen[connection.id], received, value)
 
     with open_bag(path) as reader:
         parameters = {
@@ -237,7 +228,7 @@ def read_run(
             for node, values in recorded_parameters(reader).items()
             if namespace in (None, namespace_of(node))
         }
-        names = _wheel_names(parameters)
+        gathered = _Gathered(_wheel_names(parameters))
         chosen = _choose(reader, dict(topics or {}), namespace)
         types = {one.id: one.msgtype for one in reader.connections}
         codecs = {number: topic.codec(types[number]) for number, topic in chosen.items()}
@@ -245,30 +236,78 @@ def read_run(
         noted = custom_data(reader)
     # Of this robot.
     lost = Counter({on: count for on, count in lost_messages(noted).items() if on in tally.expected})
-    series, covariances = {}, {}
-    for table in TABLES:
-        found, count = rows[table.series], len(table.columns)
-        values = np.array([row for *_, row in found], dtype=np.float64)
-        values = values.reshape(len(found), count + len(table.covariances))
-        covariances[table.series] = values[:, count:].copy()
-        series[table.series] = Series(
-            received=np.array([received for received, *_ in found], dtype=np.int64),
-            stamps=np.array([stamp for _, stamp, _ in found], dtype=np.int64),
-            values=values[:, :count].copy(),
-            columns=table.columns,
-        )
-    return Run(
+    return gathered.run(
         path=path,
-        odometry_covariances=covariances['odometry'],
-        start_covariances=covariances['start_pose'],
         parameters=parameters,
-        parameter_events=tuple(changes),
-        fault_events=tuple(fault_events),
         skipped=tally.skipped,
         missing=dict(tally.missing + lost),
         notes=(*tally.notes(), *(f'lost: {one}' for one in noted_losses(noted))),
-        **series,
     )
+
+
+def run_of(
+    name: str, messages: Iterable[tuple[int, str, Any]], parameters: dict[str, dict[str, Any]]
+) -> Run:
+    """Return a run that was not recorded.
+
+    Args:
+        name: What its pictures call it.
+        messages: Time of receipt (ns), topic without namespace, and value of each message, in order.
+        parameters: As `Run.parameters`.
+    """
+    gathered = _Gathered(_wheel_names(parameters))
+    for received, topic, value in messages:
+        if topic in READABLE:
+            # What the nodes drop is no part of a run.
+            with suppress(MessageError):
+                gathered.take(READABLE[topic], received, value)
+    return gathered.run(path=Path(name), parameters=parameters)
+
+
+class _Gathered:
+    """The messages of a run, as rows."""
+
+    def __init__(self, wheels: tuple[str, str]) -> None:
+        self._wheels = wheels
+        self._rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = defaultdict(list)
+        self._changes: list[tuple[int, Changes]] = []
+        self._fault_events: list[tuple[int, FaultEvent]] = []
+
+    def take(self, topic: Topic, received: int, value: Any) -> None:
+        """Take a message, or raise MessageError."""
+        if isinstance(value, Changes):
+            self._changes.append((received, value))
+        elif isinstance(value, FaultEvent):
+            self._fault_events.append((received, value))
+        elif topic.table is not None:
+            self._rows[topic.table.series] += [
+                (received, stamp or received, row)
+                for stamp, row in topic.table.rows(value, self._wheels)
+            ]
+
+    def run(self, **others: Any) -> Run:
+        """Return the run. `others`: its other fields."""
+        series: dict[str, Any] = {}
+        covariances: dict[str, NDArray[np.float64]] = {}
+        for table in TABLES:
+            found, count = self._rows[table.series], len(table.columns)
+            values = np.array([row for *_, row in found], dtype=np.float64)
+            values = values.reshape(len(found), count + len(table.covariances))
+            covariances[table.series] = values[:, count:].copy()
+            series[table.series] = Series(
+                received=np.array([received for received, *_ in found], dtype=np.int64),
+                stamps=np.array([stamp for _, stamp, _ in found], dtype=np.int64),
+                values=values[:, :count].copy(),
+                columns=table.columns,
+            )
+        return Run(
+            odometry_covariances=covariances['odometry'],
+            start_covariances=covariances['start_pose'],
+            parameter_events=tuple(self._changes),
+            fault_events=tuple(self._fault_events),
+            **others,
+            **series,
+        )
 
 
 def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dict[int, Topic]:

@@ -16,8 +16,8 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from diffdrive_jacobian.control import Path
-from diffdrive_jacobian.drives import DISCOVERY_PERIOD as RECORDED_PERIOD
-from diffdrive_jacobian.drives import add_nodes, in_lockstep, in_real_time, recorder_of
+from diffdrive_jacobian.drives.nodes import DISCOVERY_PERIOD as RECORDED_PERIOD
+from diffdrive_jacobian.drives.nodes import add_nodes, in_lockstep, in_real_time, recorder_of
 from diffdrive_jacobian.live.commands import Command, Pause, RobotCommand, SetSpeed, Step
 from diffdrive_jacobian.live.live_robot import LiveRobot
 from diffdrive_jacobian.live.robot_state import GoalEnd

@@ -336,6 +336,7 @@ class Writer:
         template: Any,
         fields: Values[str],
         numbers: Callable[[Any], tuple[Any, ...]] = lambda values: values,
+        kind: Structure | None = None,
     ) -> None:
         """Serialize the template.
 
@@ -346,6 +347,7 @@ class Writer:
                 `pose.position.x`, `covariance[7]` for an element, `covariance` for all elements of an
                 array or sequence.
             numbers: Returns these numbers of a value, one for each field or element of a field.
+            kind: Its type. None: that of its class.
 
         Raises:
             ValueError: A field does not exist, is no number, or is not in the order of the message.
@@ -354,7 +356,7 @@ class Writer:
         """
         encoder = _Encoder()
         message_class: Any = type(template)
-        kind = structure(message_class)
+        kind = kind or structure(message_class)
         check_plain(kind)
         try:
             encoder.encode(kind, template, '')

@@ -30,6 +30,7 @@ from diffdrive_jacobian.messages.conversion import (
     plausible_twist,
     quoted,
 )
+from diffdrive_jacobian.messages.structure import Structure
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 V = TypeVar('V')
@@ -93,8 +94,10 @@ class Codec(Generic[V]):
         """
         return Reader(kind, self.fields, self.value, deserialize=deserialize)
 
-    def writer(self, template: Any) -> Writer:
+    def writer(self, template: Any, kind: Structure | None = None) -> Writer:
         """Return what serializes values, with the strings and the lengths of a template.
+
+        `kind` is its type; None: that of its class.
 
         ValueError: it is only read.
         """
@@ -102,7 +105,7 @@ class Codec(Generic[V]):
             raise ValueError(
                 f'a codec that writes must be given, got one that only reads {self.type_name}'
             )
-        return Writer(template, self.written, self.numbers)
+        return Writer(template, self.written, self.numbers, kind)
 
 
 def twist_fields(type_name: str) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 from diffdrive_jacobian.messages.names import import_type
@@ -173,6 +174,20 @@ def _of_class(name: str, text: str) -> FieldType:
 
 def _number(text: str | None) -> int | None:
     return int(text) if text else None
+
+
+def blank(kind: FieldType) -> Any:
+    """Return a message of a type with zeros, and with empty strings and sequences."""
+    match kind:
+        case Structure():
+            return SimpleNamespace(**{name: blank(field) for name, field in kind.fields})
+        case Array():
+            return [blank(kind.element) for _ in range(kind.count)]
+        case Sequence():
+            return []
+        case Text():
+            return ''
+    return 0
 
 
 def check_plain(kind: FieldType) -> None:

@@ -40,6 +40,7 @@ from diffdrive_jacobian.messages.codecs import (
 from diffdrive_jacobian.messages.conversion import (
     SMALLEST,
     MessageError,
+    command_time,
     from_covariance,
     plausible_twist,
     set_time,
@@ -50,7 +51,6 @@ from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.ros.graph_faults import Interleaving, topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
-from diffdrive_jacobian.ros.watchdog import command_time
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds, seconds

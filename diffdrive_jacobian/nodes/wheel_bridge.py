@@ -18,7 +18,7 @@ from diffdrive_jacobian.messages.codecs import (
     WheelArray,
     Wheels,
 )
-from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.conversion import MessageError, command_time
 from diffdrive_jacobian.messages.topic_faults import UNREAD
 from diffdrive_jacobian.nodes.same_wheels import SameWheels
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
@@ -26,7 +26,7 @@ from diffdrive_jacobian.parameters.wheels import SAME_WHEELS
 from diffdrive_jacobian.ros.graph_faults import Interleaving, topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import restart_timer
-from diffdrive_jacobian.ros.watchdog import Watchdog, command_time
+from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.simulation.actuators import ramp
 from diffdrive_jacobian.simulation.robot import STANDSTILL
 from diffdrive_jacobian.simulation.speeds import Profile

@@ -10,14 +10,14 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from math import inf
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rosbags.interfaces import Qos
 
 from diffdrive_jacobian.bags.bag_writer import Summary
-from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
+from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Record, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.messages.topics import OF_EVERY_NODE
@@ -65,13 +65,26 @@ WAIT_SHOWN = 0.5
 """A wait for late messages that is longer than this is shown (s)."""
 
 
+class Sink(Protocol):
+    """Receives what a recorder records, as a `Recording` does."""
+
+    def add(self, record: Record) -> None:
+        """Take a record."""
+
+    def set_missed(self, topic: str, messages: int) -> None:
+        """Take how many messages of a topic are known to be missed so far."""
+
+    def set_left_out(self, topic: str, why: str) -> None:
+        """Take that a topic is not recorded, and why."""
+
+
 class Recorder(Node):  # type: ignore[misc]
     """Records the selected topics, each from the time at which its first publisher is discovered."""
 
     def __init__(
         self,
         selection: Selection,
-        sink: Recording,
+        sink: Sink,
         *,
         with_info: bool = False,
         now: Callable[[], int] | None = None,

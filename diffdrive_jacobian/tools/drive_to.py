@@ -20,6 +20,7 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.nodes import CONTROLLERS, NODE_PARAMETERS
 from diffdrive_jacobian.plots.output_files import NOT_OVERWRITTEN
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.text import how_to_get_ros
 from diffdrive_jacobian.tools import _cli, _output, watch_run
 from diffdrive_jacobian.tools.entry_points import DONE, FAILED, INTERRUPTED, long_lived
 
@@ -44,8 +45,11 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
+        from diffdrive_jacobian.drives.driving import has_ros
         from diffdrive_jacobian.recording.recording import open_recording, saved_on_error
 
+    if not has_ros():
+        _check_without_ros(options)
     goals: Goals = np.empty((0, 3))
     if path is not None:
         goals = path
@@ -78,7 +82,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 code = _drive_with_page(goals, options, how)
             else:
                 with closing(_Progress(goals, options, ros)) as progress:
-                    outcome = drive(goals, timeout=options.timeout, progress=progress, **how)
+                    outcome = drive(goals, timeout=options.timeout, progress=progress, keep=False, **how)
                 code = _print_outcome(outcome, options)
         except DriveError as error:
             # The recording shows what led to it.
@@ -114,6 +118,16 @@ def _check(parser: _cli.Parser, options: argparse.Namespace) -> None:
             parser.error('--port and --no-browser are options of --live')
     elif options.timeout != parser.get_default('timeout'):
         parser.error('--timeout has no effect with --live, which ends by Ctrl-C')
+
+
+def _check_without_ros(options: argparse.Namespace) -> None:
+    """Say that no nodes run, and refuse what needs them."""
+    for option in ('live', 'open'):
+        if getattr(options, option):
+            raise UserError(
+                f'--{option} needs ROS 2, there is no Python module rclpy: {how_to_get_ros()}'
+            )
+    _output.note(PROGRAM, 'ROS 2 is not available: driving without nodes, as they drive in lockstep')
 
 
 def _drive_with_page(goals: Goals, options: argparse.Namespace, how: dict[str, Any]) -> int:
@@ -251,15 +265,15 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
 
 def _reason(outcome: Outcome, timeout: float) -> str:
     """Return why the robot did not arrive."""
-    from action_msgs.msg import GoalStatus
+    from diffdrive_jacobian.messages.goal_status import GoalState
 
     if outcome.seconds > timeout:
         return f'--timeout {timeout:g} s was too short'
     reasons = {
-        GoalStatus.STATUS_ABORTED: 'goal refused or aborted',
-        GoalStatus.STATUS_CANCELED: 'goal canceled by another process',
+        GoalState.ABORTED: 'goal refused or aborted',
+        GoalState.CANCELED: 'goal canceled by another process',
     }
-    return reasons.get(outcome.status, 'ROS was shut down')
+    return reasons.get(GoalState(outcome.status), 'ROS was shut down')
 
 
 def _print_goal_end(end: GoalEnd) -> None:

@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 from support.ros_messages import odometry, receive, spoiled
 
 from diffdrive_jacobian.control import Arrival
-from diffdrive_jacobian.drives import in_lockstep, overrides
+from diffdrive_jacobian.drives.nodes import in_lockstep, overrides
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, driven_offset

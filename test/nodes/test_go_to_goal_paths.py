@@ -23,7 +23,7 @@ from support.ros_messages import goal, goals, odometry, path, pose_of, twists
 
 from diffdrive_jacobian.control import Path, PathController
 from diffdrive_jacobian.control.controllers import ALL_PATH_CONTROLLERS
-from diffdrive_jacobian.drives import overrides
+from diffdrive_jacobian.drives.nodes import overrides
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 

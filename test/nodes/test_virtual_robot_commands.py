@@ -24,9 +24,8 @@ from support.ros_messages import (
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.messages.codecs import POSE_WITH_COVARIANCE
-from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.conversion import MessageError, command_time
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.ros.watchdog import command_time
 
 BEGIN = 100 * SECOND
 late = pytest.mark.lockstep(start=100.0)

@@ -13,7 +13,7 @@ from std_msgs.msg import Float64MultiArray
 from support.lockstep_nodes import SECOND, change
 from support.ros_messages import WHEELS, instants, twist, twist_stamped
 
-from diffdrive_jacobian.drives import overrides
+from diffdrive_jacobian.drives.nodes import overrides
 from diffdrive_jacobian.faults import TimeJump
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.nodes.same_wheels import TRIES
@@ -146,6 +146,16 @@ def test_wheels_accelerate_as_those_of_the_robot_and_stop_by_deceleration(lockst
     assert speeds(out)[-1] == STOP
     assert next(one for one in stamps if one > silent) == silent + SECOND // 40
     assert 'for 0.7 s: the wheels are stopped' in capfd.readouterr().err
+
+
+def test_a_new_rate_counts_from_the_next_command_on(lockstep, add, out):
+    bridge = add(WheelBridge, **LIMITS, publish_rate=10.0)
+    for rate, v in ((10.0, 0.5), (50.0, -0.5)):
+        assert change(bridge, publish_rate=rate).successful
+        lockstep.publish('cmd_vel', twist(v, 0.0))
+        out.clear()
+        lockstep.run_for(0.31)
+        assert len(out) == int(0.3 * rate)
 
 
 def test_wheels_go_on_to_accelerate_where_time_goes_back_and_from_rest_after_a_stop(lockstep, add, out):

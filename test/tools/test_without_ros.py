@@ -6,6 +6,7 @@ come with ROS or with the extra `jazzy`.
 
 from __future__ import annotations
 
+import re
 import shutil
 import socket
 from pathlib import Path
@@ -22,8 +23,11 @@ from diffdrive_jacobian.tools.entry_points import ROS_MODULES
 pytestmark = pytest.mark.process
 
 CONFIG = Path(__file__).parents[2] / 'config' / 'turtlebot3_burger.yaml'
-WITHOUT_ROS = {'calibrate_run', 'plot_jacobian', 'plot_run', 'recover_run', 'sweep_gains', 'verify_run'}
-ARGUMENTS = {'send_goal': (1, 1), 'send_path': ('circle:1',), 'drive_to': (1, 1), 'replay_run': (REAL,)}
+WITHOUT_ROS = {
+    *('calibrate_run', 'drive_to', 'plot_jacobian', 'plot_run', 'recover_run', 'sweep_gains'),
+    'verify_run',
+}
+ARGUMENTS = {'send_goal': (1, 1), 'send_path': ('circle:1',), 'replay_run': (REAL,)}
 ABSENT = """
 import sys
 
@@ -112,13 +116,18 @@ sys.modules.pop('fcntl', None)
 """
 
 
-def test_runs_are_drawn_and_verified_where_files_have_no_locks(tmp_path, ours):
+def test_runs_are_driven_drawn_and_verified_where_files_have_no_locks(tmp_path, ours):
     """As on Windows, which has no SIGHUP either."""
     calls = [('plot_run', ours, '-o', 'run.png'), ('verify_run', ours), ('recover_run', ours)]
-    ended = run_each(calls, NO_POSIX, cwd=tmp_path)
+    driven = ('drive_to', 0.2, 0, '--lockstep', '--no-plot', '-o', 'driven')
+    *ended, drive, verified = run_each(
+        [*calls, driven, ('verify_run', 'driven')], NO_POSIX, cwd=tmp_path
+    )
     assert [(one.code, one.err) for one in ended[:2]] == 2 * [(0, '')]
     assert (tmp_path / 'run.png').stat().st_size > 10_000
     assert 'is complete: nothing to recover' in ended[2].err
+    assert drive.code == verified.code == 0
+    assert 'arrived: ' in drive.out
 
 
 def test_other_missing_modules(tmp_path):
@@ -132,3 +141,32 @@ def test_other_missing_modules(tmp_path):
     assert not list(tmp_path.iterdir())
     with pytest.raises(AssertionError, match="ModuleNotFoundError: No module named 'numpy'"):
         run_each([('drive_to', 1, 1)], ABSENT.format(modules=('numpy',)))
+
+
+def test_drive_to_drives_without_nodes_and_says_so(tmp_path):
+    parameters = ('--ros-args', '-p', 'kv:=3', '-p', 'kp:=12')
+    drive = ('drive_to', 0.2, 0.1, '--lockstep', '--no-record')
+    calls = [
+        (*drive, *parameters),
+        ('drive_to', 0.1, 0, '--no-plot', '-o', 'run', *parameters),
+        *((*drive, *more) for more in (('--robot', 'turtlebot3_burger'), ('--timeout', 0.5))),
+        *((*drive, '--ros-args', *more) for more in (('-p', 'kpp:=4.0'), ('-r', 'a:=b'), ('-p', 'kp'))),
+        ('drive_to', 1, 1, '--live', '--no-browser'),
+        ('drive_to', 1, 1, '--open', '--no-record'),
+    ]
+    first, real, *others = without_ros(*calls, cwd=tmp_path)
+    said = 'drive_to: ROS 2 is not available: driving without nodes, as they drive in lockstep'
+    assert (first.code, first.err.splitlines()[0]) == (0, said)
+    assert first.out == run(*calls[0]).out
+    assert real.code == 0
+    assert len(read_run(tmp_path / 'run').odometry) > 10
+    assert [one.code for one in others] == [0, 1, 2, 2, 2, 2, 2]
+    words = (
+        'parameter .kpp.; did you mean .kp.',
+        "got '-r'",
+        "got 'kp'",
+        '--live needs',
+        '--open needs',
+    )
+    for word, one in zip(words, others[2:], strict=True):
+        assert re.search(word, one.err), one

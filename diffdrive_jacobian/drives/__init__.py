@@ -1,0 +1,41 @@
+"""Drives of the virtual robot to goals: robot, controller and wheel bridge in one process.
+
+    from diffdrive_jacobian.drives import drive
+
+    outcome = drive([[1.0, 1.0]], lockstep=True)
+    print(outcome.arrived, outcome.pose, outcome.seconds)
+    outcome.plot()
+
+The robot is driven by its wheels, so that the whole Jacobian chain is in use:
+goal -> control law -> body twist -> J_w^-1 -> wheel speeds -> J_w -> body twist -> S(theta) -> pose.
+
+Where rclpy is installed the nodes run. Elsewhere the same robot, bridge and laws are used without them,
+and drive as in lockstep, to the last bit.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from diffdrive_jacobian import lazy
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.drives.driving import drive
+    from diffdrive_jacobian.drives.nodes import in_lockstep, in_real_time
+    from diffdrive_jacobian.drives.outcome import DriveError, DriveProgress, Outcome, waypoints_through
+
+__all__ = [
+    'DriveError',
+    'DriveProgress',
+    'Outcome',
+    'drive',
+    'in_lockstep',
+    'in_real_time',
+    'waypoints_through',
+]
+if not TYPE_CHECKING:
+    # Without rclpy drives need no nodes.
+    _MODULES = {'drive': 'driving', 'in_lockstep': 'nodes', 'in_real_time': 'nodes'}
+    __getattr__, __dir__ = lazy.attach(
+        __name__, {name: f'drives.{_MODULES.get(name, "outcome")}' for name in __all__}
+    )

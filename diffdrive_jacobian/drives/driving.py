@@ -1,0 +1,161 @@
+"""A drive, by the nodes where rclpy is installed, and without them elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diffdrive_jacobian.control import Path
+from diffdrive_jacobian.control.path_source import is_shape, planned_path
+from diffdrive_jacobian.drives.outcome import DriveProgress, Outcome, Request, waypoints_through
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
+from diffdrive_jacobian.signals import Signals
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.recording.recording import Recording
+    from diffdrive_jacobian.ros.runner import NodeRunner
+
+
+def drive(
+    goals: ArrayLike | Path | str,
+    *,
+    relative: bool | None = None,
+    controller: str | None = None,
+    path_controller: str | None = None,
+    runner: NodeRunner | None = None,
+    lockstep: bool = False,
+    isolated: bool = True,
+    timeout: float = 300.0,
+    parameters: Mapping[str, Any] | None = None,
+    robot_parameters: Mapping[str, Any] | None = None,
+    recording: Recording | str | FilePath | None = None,
+    keep: bool = True,
+    ros_arguments: Sequence[str] = (),
+    signals: Signals | None = None,
+    progress: DriveProgress | None = None,
+) -> Outcome:
+    """Drive the virtual robot to goals in order, or along a path, with all three nodes in this process.
+
+    Where rclpy is not installed, the robot, the bridge and the controller are driven without nodes: with
+    `lockstep` in simulated time, otherwise in real time.
+
+    Args:
+        goals: `[x, y]` of each goal, shape (n, 2), or `[x, y, theta]`, shape (n, 3) (m, m, rad). theta
+            matters for controllers that use the heading, and with the parameter `use_goal_heading`. Or a
+            path, with times a trajectory, or its text as `control.path_source.planned_path` takes it:
+            'circle:1.0' or the name of a file.
+        relative: Whether the goals are in the body frame of the robot where it starts. Otherwise they
+            are in the frame of the odometry. None: shapes such as 'circle:1.0' are.
+        controller: The parameter `controller` of go_to_goal. None: as `parameters` say.
+        path_controller: Likewise.
+        runner: Runs the nodes, and may run others: `in_real_time` or `in_lockstep`. The nodes stay in
+            it. None: one is created as `lockstep`, `isolated` and `ros_arguments` say, and closed at
+            the end.
+        lockstep: Whether to drive in simulated time, as fast as possible and with the same result each
+            time. rclpy must not be initialised then.
+        isolated: Whether no other process can communicate with the nodes. Always so in lockstep.
+        timeout: Longest duration, of all goals together (s).
+        parameters: Parameters of go_to_goal, by name. They take precedence over `ros_arguments`.
+        robot_parameters: Likewise of virtual_robot.
+        recording: The bag to write, or a recording of what the nodes publish, which the caller must
+            finish. None: none.
+        keep: Whether the outcome has the run. It has none with a runner, and none of a recording that
+            the caller finishes.
+        ros_arguments: ROS arguments of all nodes, such as `['--ros-args', '-p', 'kp:=4.0']`. Without
+            rclpy, parameters and files of parameters.
+        signals: Counter of the signals that end the drive. None: no signal does.
+        progress: Receives the progress. None: nothing does.
+
+    Raises:
+        UserError: A node cannot run with the parameters or ROS arguments given, the bag cannot be
+            written there, or an argument needs rclpy, which is not installed.
+        DriveError: In lockstep, a callback blocks, or simulated time cannot advance.
+        RecordingError: The bag is not complete.
+        PathError: `goals` is a text that is no path.
+        ValueError: `goals` has another shape, `timeout` is not positive, `lockstep` is not isolated, or
+            one of the arguments for a new runner is given together with `runner`.
+    """
+    number('timeout', timeout, positive_or_infinite)
+    if lockstep and not isolated:
+        raise ValueError('a drive in lockstep is always isolated: other processes have another clock')
+    if runner is not None and (lockstep or not isolated or ros_arguments):
+        raise ValueError('lockstep, isolated and ros_arguments are those of the runner, if one is given')
+    if relative is None:
+        relative = isinstance(goals, str) and is_shape(goals)
+    laws = {'controller': controller, 'path_controller': path_controller}
+    chosen = {name: law for name, law in laws.items() if law is not None}
+    to = as_goals(goals)
+    with ExitStack() as stack:
+        own = None
+        if isinstance(recording, (str, FilePath)):
+            # Slow to import.
+            from diffdrive_jacobian.recording.recording import open_recording, saved_on_error
+
+            recording = own = open_recording('drive', str(recording), lossless=lockstep)
+            stack.enter_context(saved_on_error(own))
+        request = Request(
+            goals=to,
+            relative=relative,
+            timeout=timeout,
+            parameters={**(parameters or {}), **chosen},
+            robot_parameters=robot_parameters or {},
+            recording=recording,
+            keep=keep and recording is None and runner is None,
+            signals=signals or Signals(),
+            progress=progress,
+        )
+        if runner is not None or has_ros():
+            from diffdrive_jacobian.drives import nodes
+
+            outcome = nodes.drive(
+                request,
+                runner=runner,
+                lockstep=lockstep,
+                isolated=isolated,
+                ros_arguments=ros_arguments,
+            )
+        else:
+            from diffdrive_jacobian.drives import values
+
+            if not isolated:
+                raise UserError('other processes need rclpy, which is not installed')
+            outcome = values.drive(request, lockstep=lockstep, ros_arguments=ros_arguments)
+        if own is not None:
+            own.finish()
+    if own is None or not keep:
+        return outcome
+    from diffdrive_jacobian.bags.run import read_run
+
+    return replace(outcome, kept=read_run(own.bag))
+
+
+def has_ros() -> bool:
+    """Return whether the nodes can run: rclpy is installed."""
+    try:
+        return find_spec('rclpy') is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def as_goals(goals: ArrayLike | Path | str) -> NDArray[np.float64] | Path:
+    """Return the goals of a drive as poses, shape (n, 3), or as a path.
+
+    Raises:
+        ValueError: They are none.
+    """
+    if isinstance(goals, str):
+        return planned_path(goals)
+    if isinstance(goals, Path):
+        return goals
+    poses = np.asarray(goals, dtype=np.float64)
+    if poses.ndim != 2 or poses.shape[1] not in (2, 3) or not len(poses):
+        raise ValueError(f'goals must have shape (n, 2) or (n, 3) with n > 0, got {poses.shape}')
+    return waypoints_through(poses) if poses.shape[1] == 2 else poses

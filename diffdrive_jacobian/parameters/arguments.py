@@ -1,0 +1,86 @@
+"""Parameters on the command line of ROS nodes, where no node is there to take them. Imports no ROS."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from itertools import pairwise
+from typing import Any
+
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.parameters.file import concerns, sections
+from diffdrive_jacobian.text import printable
+
+
+def given_parameters(arguments: Sequence[str], nodes: Collection[str]) -> dict[str, dict[str, Any]]:
+    """Return the parameters that ROS arguments give to nodes; later ones take precedence.
+
+    Args:
+        arguments: The arguments, which follow `--ros-args`. A level of the log has no effect.
+        nodes: Fully qualified names of the nodes.
+
+    Returns:
+        The values by name, for each node.
+
+    Raises:
+        UserError: An argument is neither a parameter nor a file of parameters, or it is invalid.
+    """
+    given: dict[str, dict[str, Any]] = {node: {} for node in nodes}
+    for pattern, values in _rules(arguments):
+        for node in nodes:
+            if concerns(pattern, node):
+                given[node].update(values)
+    return given
+
+
+def check_names(arguments: Sequence[str], known: Collection[str]) -> None:
+    """Raise UserError if ROS arguments give a parameter by `-p` that is not known.
+
+    A file may be for other processes, too.
+    """
+    for flag, rule in pairwise(arguments):
+        if flag in ('-p', '--param'):
+            _, values = _rule(rule)
+            for text in unknown(values, known):
+                raise UserError(f'no node of this program has the {text}')
+
+
+def unknown(names: Iterable[str], known: Collection[str]) -> Iterator[str]:
+    """Yield `parameter 'NAME'`, with what was probably meant, for each name that is not known."""
+    for name in sorted({*names} - {*known}):
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"; did you mean '{close[0]}'?" if close else ''
+        yield f"parameter '{printable(name)}'{hint}"
+
+
+def _rules(arguments: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield parameters, each with the name of the nodes for which they are."""
+    words = iter(arguments)
+    for word in words:
+        if word in ('--ros-args', '--'):
+            continue
+        value = next(words, None)
+        if word not in ('-p', '--param', '--params-file', '--log-level') or value is None:
+            raise UserError(
+                f'without rclpy, ROS arguments must be -p NAME:=VALUE or --params-file FILE, got '
+                f"'{printable(word)}'"
+            )
+        if word == '--params-file':
+            yield from sections(value)
+        elif word != '--log-level':
+            yield _rule(value)
+
+
+def _rule(text: str) -> tuple[str, dict[str, Any]]:
+    """Return the parameter of a rule `NAME:=VALUE` or `NODE:NAME:=VALUE`."""
+    # Slow to import.
+    from diffdrive_jacobian.safe_yaml import YAML_ERRORS, load_yaml
+
+    left, separator, value = text.partition(':=')
+    node, _, name = left.rpartition(':')
+    try:
+        if not (separator and name):
+            raise ValueError('it has no name')
+        return f'/{node.strip("/")}' if node else '/**', {name: load_yaml(value)}
+    except YAML_ERRORS as error:
+        raise UserError(f"ROS arguments: -p must be NAME:=VALUE, got '{printable(text)}'") from error

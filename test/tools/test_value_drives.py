@@ -1,0 +1,163 @@
+"""Drives without nodes: they drive as the nodes do in lockstep, to the last bit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.bags import read_run, verify
+from diffdrive_jacobian.control.path_source import PathError
+from diffdrive_jacobian.drives import drive, driving, nodes, values
+from diffdrive_jacobian.drives.driving import as_goals
+from diffdrive_jacobian.drives.outcome import Outcome, Request
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.signals import Signals
+
+pytestmark = pytest.mark.slow
+QUICK = {'kp': 12.0, 'kv': 3.0}
+LIMITS = {
+    f'{axis}.{limit}': sign * value
+    for axis, value in (('linear.x', 0.4), ('angular.z', 1.5))
+    for limit, sign in (('max_acceleration', 1.0), ('max_deceleration', -1.0))
+}
+SERIES = (
+    *('odometry', 'ground_truth', 'cmd_vel', 'cmd_vel_out', 'start_pose', 'wheel_commands', 'wheels'),
+    *('goals', 'planned_path', 'goal_status'),
+)
+TO = [[0.2, 0.0], [0.2, 0.2]]
+BRIDGE = [word for name, value in LIMITS.items() for word in ('-p', f'wheel_bridge:{name}:={value}')]
+
+
+def request(goals, timeout=2.5, **given):
+    relative = isinstance(goals, str)
+    how = {'parameters': {}, 'robot_parameters': {}, 'recording': None, 'progress': None, 'keep': True}
+    return Request(
+        goals=as_goals(goals), relative=relative, timeout=timeout, signals=Signals(), **{**how, **given}
+    )
+
+
+@pytest.mark.parametrize(
+    ('goals', 'parameters', 'robot', 'arguments'),
+    [
+        (TO, QUICK, {}, []),
+        (TO, {**QUICK, 'pass_waypoints': True}, {'simulate_slip': True, 'slip_seed': 3}, []),
+        ([[0.1, 0.2, -2.0]], {'use_goal_heading': True, **LIMITS, 'stop_in_time': True}, LIMITS, []),
+        (TO, QUICK, {'lag': 0.1, 'delay': 0.07, 'publish_rate': 30.0}, []),
+        (TO, {'controller': 'offset_point', **QUICK}, {'x': 0.3, 'theta': 4.0}, []),
+        # Odometry is rarer than the timeouts: the robot stops again and again.
+        (TO, {'odom_timeout': 0.3}, {'publish_rate': 1.7}, []),
+        (TO, QUICK, {}, [*BRIDGE, '-p', 'wheel_bridge:publish_rate:=77.0']),
+        ('eight:0.5', {'path_controller': 'pure_pursuit'}, LIMITS, []),
+        ('circle:0.3', {'path_controller': 'kanayama', **LIMITS}, {'lag': 0.05}, []),
+        ('circle:0.3', {'path_controller': 'offset_point'}, {'simulate_slip': True}, []),
+        ('eight:0.4', {'path_controller': 'dynamic_feedback', 'linear.x.max_velocity': 0.1}, {}, []),
+        # Refused: the path begins too far away.
+        (as_goals('circle:0.3'), {}, {'x': 3.0}, []),
+        (TO, QUICK, {}, ['-p', 'max_wheel_velocity:=2.0', '-p', 'cmd_vel_timeout:=0.015']),
+    ],
+)
+def test_it_drives_as_the_nodes_in_lockstep(goals, parameters, robot, arguments):
+    asked = request(goals, parameters=parameters, robot_parameters=robot)
+    arguments = ['--ros-args', '--log-level', 'fatal', *arguments]
+    one = nodes.drive(asked, runner=None, lockstep=True, isolated=True, ros_arguments=arguments)
+    two = values.drive(
+        request(goals, parameters=parameters, robot_parameters=robot),
+        lockstep=True,
+        ros_arguments=arguments,
+    )
+    for field in fields(Outcome):
+        if field.name != 'kept':
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name))
+    for name in SERIES:
+        of_nodes, of_values = getattr(one.run, name), getattr(two.run, name)
+        np.testing.assert_array_equal(of_nodes.received, of_values.received)
+        np.testing.assert_array_equal(of_nodes.stamps, of_values.stamps)
+        assert of_nodes.values.tobytes() == of_values.values.tobytes(), name
+    np.testing.assert_array_equal(one.run.odometry_covariances, two.run.odometry_covariances)
+    assert one.run.parameters == two.run.parameters
+    assert len(two.run.odometry) > 1
+
+
+def test_progress_and_signals_are_those_of_the_nodes():
+    class Progress:
+        def __init__(self, signals=None):
+            self.seen, self.signals = [], signals
+
+        def nodes_created(self, names):
+            self.names = names
+
+        def driving(self, *state):
+            self.seen.append(state)
+            if self.signals is not None and len(self.seen) == 10:
+                self.signals.count += 1
+
+    one, two = Progress(), Progress()
+    asked = request(TO, parameters=QUICK, progress=one)
+    nodes.drive(asked, runner=None, lockstep=True, isolated=True, ros_arguments=[])
+    values.drive(request(TO, parameters=QUICK, progress=two), lockstep=True)
+    assert one.seen == two.seen
+    signals = Signals()
+    stopped = replace(request(TO, progress=Progress(signals)), signals=signals)
+    outcome = values.drive(stopped, lockstep=True)
+    assert outcome.interrupted
+    assert outcome.seconds < 0.3
+    assert outcome.run.odometry.values[-1, 3:].tolist() == [0.0, 0.0]
+
+
+def test_real_time_passes():
+    slow = values.drive(request([[0.5, 0.0]], timeout=0.3), lockstep=False)
+    received = slow.run.odometry.received
+    assert abs(np.ptp(received) / 1e9 - (len(received) - 1) / 50) < 1e-6
+    assert slow.seconds == pytest.approx(0.3, abs=0.03)
+
+
+def test_unknown_parameters_are_named(caplog):
+    values.drive(request(TO, timeout=0.1, parameters={'kpp': 1.0}), lockstep=True)
+    assert "unknown parameter 'kpp'; did you mean 'kp'?" in caplog.text
+    with pytest.raises(UserError, match="parameter 'kpp'; did you mean 'kp'"):
+        values.drive(request(TO), lockstep=True, ros_arguments=['-p', 'kpp:=1'])
+
+
+def test_the_bag_has_the_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(driving, 'has_ros', lambda: False)
+    outcome = drive('circle:0.3', timeout=1.0, lockstep=True, recording=tmp_path / 'run')
+    kept = drive('circle:0.3', timeout=1.0, lockstep=True, keep=True).run
+    run = read_run(tmp_path / 'run')
+    for name in SERIES:
+        assert getattr(run, name).values.tobytes() == getattr(kept, name).values.tobytes(), name
+    assert outcome.run.odometry.values.tobytes() == kept.odometry.values.tobytes()
+    assert run.parameters.keys() == kept.parameters.keys()
+    assert verify(run).holds(1e-9, 1e-9)
+    assert not run.notes
+    with pytest.raises(UserError, match='exists already'):
+        drive('circle:0.3', lockstep=True, recording=tmp_path / 'run')
+    with pytest.raises(UserError, match='other processes need rclpy'):
+        drive(TO, isolated=False)
+
+
+def test_an_outcome_shows_its_run():
+    outcome = drive(TO, lockstep=True, timeout=1.0, controller='offset_point', parameters=QUICK)
+    assert repr(outcome).startswith('Outcome(')
+    assert '\n' not in repr(outcome)
+    assert len(outcome.table['x_m']) == len(outcome.run.odometry)
+    assert outcome.run.parameters['/go_to_goal']['controller'] == 'offset_point'
+    assert outcome.plot().axes
+    assert 'data:image/svg+xml;base64,' in outcome._repr_html_()
+    with pytest.raises(ValueError, match='the run was not kept'):
+        replace(outcome, kept=None).plot()
+
+
+def test_a_text_is_a_path(tmp_path):
+    poses = tmp_path / 'poses.csv'
+    poses.write_text('x,y\n1,1\n2,1\n')
+    at = {'x': 1.0, 'y': 1.0}
+    # Poses of a file are in the frame of the odometry, shapes begin at the robot.
+    for text, x in ((str(poses), 1.0), ('line:1', 1.0)):
+        outcome = drive(text, lockstep=True, timeout=0.5, robot_parameters=at)
+        assert outcome.run.planned_path.values[0, :2].tolist() == [x, 1.0]
+    with pytest.raises(PathError, match='path must be'):
+        drive('somewhere')
+    assert math.isnan(drive(TO, lockstep=True, timeout=0.1).across)
