@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.recording.recording import Recording
     from diffdrive_jacobian.ros.runner import NodeRunner
 
+QUIET = ('--ros-args', '--log-level', 'warn', '--')
+
 
 def drive(
     goals: ArrayLike | Path | str,
@@ -120,7 +122,8 @@ def drive(
                 runner=runner,
                 lockstep=lockstep,
                 isolated=isolated,
-                ros_arguments=ros_arguments,
+                # A notebook shows what is logged.
+                ros_arguments=[*QUIET, *ros_arguments] if runner is None else (),
             )
         else:
             from diffdrive_jacobian.drives import values

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from diffdrive_jacobian.bags.run import Run
+    from diffdrive_jacobian.plots.film import Film
     from diffdrive_jacobian.recording.recording import Recording
 
 STANDING = 1e-3
@@ -103,6 +104,20 @@ class Outcome:
         from diffdrive_jacobian.plots.run_pictures import run_figure
 
         return run_figure(self.run)
+
+    def animate(self, speed: float = 1.0) -> Film:
+        """Return a film of the run, which a notebook shows and `save` writes.
+
+        Args:
+            speed: How much faster than it was the film is.
+
+        Raises:
+            ValueError: The run was not kept, or the speed is not positive or too small.
+            ModuleNotFoundError: matplotlib is not installed.
+        """
+        from diffdrive_jacobian.plots.film import Film
+
+        return Film(self.run, speed=speed)
 
     def __repr__(self) -> str:
         """Return the end of the drive in one line."""

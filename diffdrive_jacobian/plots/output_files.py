@@ -16,6 +16,8 @@ from diffdrive_jacobian.errors import NotDoneError, UserError
 
 FORMATS = ('png', 'svg', 'pdf')
 """File name extensions of figures."""
+FILM_FORMATS = ('gif', 'mp4')
+"""File name extensions of films."""
 NOT_OVERWRITTEN = 'it is not overwritten (--force overwrites files)'
 
 

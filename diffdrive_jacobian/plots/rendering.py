@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
 
@@ -45,12 +45,15 @@ def styled() -> Any:
 
 
 def picture(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Let a function draw its figure in this style."""
+    """Let a function draw its figure in this style, which notebooks show."""
 
     @wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
         with styled():
-            return draw(*args, **kwargs)
+            drawing = draw(*args, **kwargs)
+        # IPython calls this. It knows only figures of pyplot.
+        drawing._repr_png_ = partial(render, drawing, 'png')  # type: ignore[attr-defined]
+        return drawing
 
     return drawn
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 from diffdrive_jacobian.bags.run import Run, read_run
@@ -13,6 +14,7 @@ from diffdrive_jacobian.bags.table import DECIMALS, csv_text
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.topics import READABLE
 from diffdrive_jacobian.plots.output_files import (
+    FILM_FORMATS,
     FORMATS,
     cannot_write,
     check_directory,
@@ -30,12 +32,20 @@ PROGRAM = 'plot_run'
 @_output.tool(PROGRAM)
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
-    options = _parser().parse(arguments, ros=False)
+    parser = _parser()
+    options = parser.parse(arguments, ros=False)
+    parser.refuse_without(options, '--speed', '--film')
     bags = _cli.given_bags(options)
     given = [name for name, _ in options.topics]
     if repeated := [name for name in given if given.count(name) > 1]:
         raise UserError(f'--topic can be given once for each name, got {repeated[0]} again')
-    picture, tables = _picture(options, bags), _tables(options, bags)
+    film = None
+    if options.film is not None:
+        film = new_file(options.film, FILM_FORMATS, 'film', replace=options.force)
+    # Whoever wants a film need not want a picture.
+    drawn = film is None or options.output is not None
+    picture = _picture(options, bags) if drawn else None
+    tables = _tables(options, bags)
     runs, found = [], []
     for bag in bags:
         with _output.busy(PROGRAM, f'reading {bag}'):
@@ -51,9 +61,13 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         for note in run.notes:
             _output.note(PROGRAM, f'{bag}: {note}')
         _output.check(signals)
-    content = _output.drawn(PROGRAM, signals, extension(picture), lambda: run_figure(runs))
-    _output.write(picture, content, replace=options.force)
-    _output.say(picture)
+    if picture is not None:
+        content = _output.drawn(PROGRAM, signals, extension(picture), lambda: run_figure(runs))
+        _output.write(picture, content, replace=options.force)
+        _output.say(picture)
+    if film is not None:
+        _output.write(film, _filmed(runs, film, options.speed, signals), replace=options.force)
+        _output.say(film)
     for run, path in zip(runs, tables, strict=bool(tables)):
         _output.check(signals)
         with _output.busy(PROGRAM, f'writing {path}'):
@@ -61,6 +75,28 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         _output.say(path)
     print(*table_of(names_of(bags), found), sep='\n')
     return DONE
+
+
+def _filmed(runs: Sequence[Run], path: Path, speed: float, signals: Signals) -> bytes:
+    """Return the content of a file with a film, with a progress bar.
+
+    Raises:
+        UserError: matplotlib or ffmpeg is not installed, or the film is too long.
+        InterruptionError: A signal was caught.
+    """
+    from diffdrive_jacobian.plots.film import Film
+
+    with _output.explaining_no_matplotlib(), closing(_output.Bar()) as bar:
+
+        def progress(frame: int, frames: int) -> None:
+            _output.check(signals)
+            bar.show('filming', frame / frames, f'{frame} of {frames} frames')
+
+        try:
+            film = Film(runs, speed=speed)
+        except ValueError as error:
+            raise UserError(str(error)) from error
+        return film.content(extension(path), progress)
 
 
 def _write_table(run: Run, path: Path, *, replace: bool) -> None:
@@ -162,7 +198,13 @@ def _parser() -> _cli.Parser:
         help='also write the values over time: to FILE.csv, or to BAG.csv for each bag in a directory. '
         f'Times are exact, values are rounded to {DECIMALS} decimal places (default: none)',
     )
-    parser.add_force('the picture and the tables')
+    parser.add_argument(
+        '--film',
+        metavar='FILE',
+        help=f'write a film, .{", .".join(FILM_FORMATS)}, and a picture only with -o; MP4 needs ffmpeg',
+    )
+    parser.add_value('--speed', 'X', 'how much faster than it was the film is', default=1.0)
+    parser.add_force('the picture, the film and the tables')
     parser.add_namespace()
     parser.add_argument(
         '--topic',

@@ -39,35 +39,75 @@ def request(goals, timeout=2.5, **given):
     )
 
 
-@pytest.mark.parametrize(
-    ('goals', 'parameters', 'robot', 'arguments'),
-    [
-        (TO, QUICK, {}, []),
-        (TO, {**QUICK, 'pass_waypoints': True}, {'simulate_slip': True, 'slip_seed': 3}, []),
-        ([[0.1, 0.2, -2.0]], {'use_goal_heading': True, **LIMITS, 'stop_in_time': True}, LIMITS, []),
-        (TO, QUICK, {'lag': 0.1, 'delay': 0.07, 'publish_rate': 30.0}, []),
-        (TO, {'controller': 'offset_point', **QUICK}, {'x': 0.3, 'theta': 4.0}, []),
-        # Odometry is rarer than the timeouts: the robot stops again and again.
-        (TO, {'odom_timeout': 0.3}, {'publish_rate': 1.7}, []),
-        (TO, QUICK, {}, [*BRIDGE, '-p', 'wheel_bridge:publish_rate:=77.0']),
-        ('eight:0.5', {'path_controller': 'pure_pursuit'}, LIMITS, []),
-        ('circle:0.3', {'path_controller': 'kanayama', **LIMITS}, {'lag': 0.05}, []),
-        ('circle:0.3', {'path_controller': 'offset_point'}, {'simulate_slip': True}, []),
-        ('eight:0.4', {'path_controller': 'dynamic_feedback', 'linear.x.max_velocity': 0.1}, {}, []),
-        # Refused: the path begins too far away.
-        (as_goals('circle:0.3'), {}, {'x': 3.0}, []),
-        (TO, QUICK, {}, ['-p', 'max_wheel_velocity:=2.0', '-p', 'cmd_vel_timeout:=0.015']),
-    ],
-)
-def test_it_drives_as_the_nodes_in_lockstep(goals, parameters, robot, arguments):
-    asked = request(goals, parameters=parameters, robot_parameters=robot)
-    arguments = ['--ros-args', '--log-level', 'fatal', *arguments]
-    one = nodes.drive(asked, runner=None, lockstep=True, isolated=True, ros_arguments=arguments)
-    two = values.drive(
-        request(goals, parameters=parameters, robot_parameters=robot),
-        lockstep=True,
-        ros_arguments=arguments,
-    )
+CASES = {
+    'goals': {'parameters': QUICK},
+    'goals passed by a robot that slips': {
+        'parameters': {**QUICK, 'pass_waypoints': True},
+        'robot': {'simulate_slip': True, 'slip_seed': 3},
+    },
+    'a heading, and limits': {
+        'goals': [[0.1, 0.2, -2.0]],
+        'parameters': {'use_goal_heading': True, **LIMITS, 'stop_in_time': True},
+        'robot': LIMITS,
+    },
+    'lag, delay, and a period that is no whole number': {
+        'parameters': QUICK,
+        'robot': {'lag': 0.1, 'delay': 0.07, 'publish_rate': 30.0},
+    },
+    'an offset point from another pose': {
+        'parameters': {'controller': 'offset_point', **QUICK},
+        'robot': {'x': 0.3, 'theta': 4.0},
+    },
+    # The robot stops again and again.
+    'odometry that is rarer than the timeouts': {
+        'parameters': {'odom_timeout': 0.3},
+        'robot': {'publish_rate': 1.7},
+    },
+    'limits of the bridge': {
+        'parameters': QUICK,
+        'arguments': [*BRIDGE, '-p', 'wheel_bridge:publish_rate:=77.0'],
+    },
+    'arguments for all': {
+        'parameters': QUICK,
+        'arguments': ['-p', 'max_wheel_velocity:=2.0', '-p', 'cmd_vel_timeout:=0.015'],
+    },
+    'pure pursuit': {
+        'goals': 'eight:0.5',
+        'parameters': {'path_controller': 'pure_pursuit'},
+        'robot': LIMITS,
+    },
+    'kanayama': {
+        'goals': 'circle:0.3',
+        'parameters': {'path_controller': 'kanayama', **LIMITS},
+        'robot': {'lag': 0.05},
+    },
+    'offset point': {
+        'goals': 'circle:0.3',
+        'parameters': {'path_controller': 'offset_point'},
+        'robot': {'simulate_slip': True},
+    },
+    'dynamic feedback': {
+        'goals': 'eight:0.4',
+        'parameters': {
+            'path_controller': 'dynamic_feedback',
+            'linear.x.max_velocity': 0.1,
+        },
+    },
+    'a path that begins too far away': {
+        'goals': as_goals('circle:0.3'),
+        'robot': {'x': 3.0},
+    },
+}
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_it_drives_as_the_nodes_in_lockstep(name):
+    case = {'goals': TO, 'parameters': {}, 'robot': {}, 'arguments': [], **CASES[name]}
+    how = {'parameters': case['parameters'], 'robot_parameters': case['robot']}
+    arguments = ['--ros-args', '--log-level', 'fatal', *case['arguments']]
+    with_nodes = {'runner': None, 'lockstep': True, 'isolated': True}
+    one = nodes.drive(request(case['goals'], **how), ros_arguments=arguments, **with_nodes)
+    two = values.drive(request(case['goals'], **how), lockstep=True, ros_arguments=arguments)
     for field in fields(Outcome):
         if field.name != 'kept':
             np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name))

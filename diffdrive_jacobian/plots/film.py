@@ -1,0 +1,167 @@
+"""A film of one or several runs: robots drive through their figure, and a line shows the time."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from diffdrive_jacobian.bags.run import Run
+from diffdrive_jacobian.bags.timeline import Array, Timeline, timeline
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.numerics.checks import number, positive
+from diffdrive_jacobian.plots import run_panels, sketch
+from diffdrive_jacobian.plots.output_files import FILM_FORMATS, extension
+from diffdrive_jacobian.plots.rendering import styled
+from diffdrive_jacobian.plots.run_pictures import COLORS, run_figure
+from diffdrive_jacobian.plots.run_plane import VISIBLE, size
+
+RATE = 20
+"""Frames per second of a film: GIF has periods of whole hundredths of a second."""
+MOST_FRAMES = 3000
+"""Largest number of frames: a film of two and a half minutes."""
+DPI = 90
+"""Resolution (dots per inch)."""
+INLINE_FRAMES = 150
+"""Largest number of frames of a film in a notebook, each of which is a picture in it."""
+NO_FFMPEG = 'a film in MP4 needs the program ffmpeg, which is not installed; GIF needs none'
+
+
+class Film:
+    """A film of runs. A notebook shows it.
+
+    Attributes:
+        frames: Its number of frames.
+        seconds: Its duration (s).
+    """
+
+    def __init__(self, runs: Run | Sequence[Run], *, speed: float = 1.0) -> None:
+        """Draw the figure of the runs, into which each frame puts the robots.
+
+        Args:
+            runs: As for `run_figure`.
+            speed: How much faster than it was the film is.
+
+        Raises:
+            ValueError: The speed is not positive, or so small that there are more than `MOST_FRAMES`.
+            BagError, ModuleNotFoundError: As for `run_figure`.
+        """
+        number('speed', speed, positive)
+        runs = [runs] if isinstance(runs, Run) else runs
+        self._timelines = [timeline(run) for run in runs]
+        zeros = map(run_panels.zero, self._timelines)
+        self._times = [
+            np.maximum.accumulate(one.time) - zero
+            for one, zero in zip(self._timelines, zeros, strict=True)
+        ]
+        first, last = run_panels.window(self._timelines)
+        self.seconds = (last - first) / speed
+        self.frames = int(self.seconds * RATE) + 2
+        if self.frames > MOST_FRAMES:
+            least = (last - first) * RATE / MOST_FRAMES
+            raise ValueError(f'speed must be at least {least:.3g} for such a long run, got {speed:g}')
+        self._shown = np.linspace(first, last, self.frames)
+        self._figure = run_figure(runs)
+        self._robots = self._draw()
+
+    def save(self, path: str | Path, *, progress: Callable[[int, int], object] | None = None) -> None:
+        """Write it to a file, `.gif` or `.mp4`, which is replaced.
+
+        Args:
+            path: The file.
+            progress: Called with the number of a frame and that of all.
+
+        Raises:
+            UserError: The file has another ending, or there is no ffmpeg for an MP4.
+            OSError: It cannot be written.
+        """
+        Path(path).write_bytes(self.content(extension(Path(path)), progress))
+
+    def content(self, ending: str, progress: Callable[[int, int], object] | None = None) -> bytes:
+        """Return the content of a file of one of the `FILM_FORMATS`; the rest as for `save`."""
+        from matplotlib.animation import FFMpegWriter, PillowWriter
+
+        if ending not in FILM_FORMATS:
+            raise UserError(f'a film must end in .{", .".join(FILM_FORMATS)}, got {ending!r}')
+        if ending == 'mp4' and not FFMpegWriter.isAvailable():
+            raise UserError(NO_FFMPEG)
+        writer: Any = (PillowWriter if ending == 'gif' else FFMpegWriter)(fps=RATE)
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder, f'film.{ending}')
+            with styled():
+                self._animation(self.frames).save(file, writer, dpi=DPI, progress_callback=progress)
+            return file.read_bytes()
+
+    def _repr_html_(self) -> str:
+        """Return the film for a notebook, with buttons."""
+        with styled():
+            return str(self._animation(min(self.frames, INLINE_FRAMES)).to_jshtml())
+
+    def _animation(self, frames: int) -> Any:
+        from matplotlib.animation import FuncAnimation
+
+        shown = self._shown[np.linspace(0, self.frames - 1, frames).astype(int)]
+        interval = 1e3 * self.seconds / frames
+        return FuncAnimation(self._figure, self._show, shown, interval=interval, repeat=False)
+
+    def _draw(self) -> list[Callable[[float], None]]:
+        """Draw what moves; return functions that move it to a time."""
+        plane, *panels = self._figure.axes
+        left, right = plane.get_xlim()
+        inches = plane.get_window_extent().width / self._figure.dpi / (right - left)
+        moves = [
+            _robot(plane, one, times, color, inches)
+            for one, times, color in zip(self._timelines, self._times, cycle(COLORS), strict=False)
+        ]
+        cursors = [panel.axvline(self._shown[0], color='black', lw=1.0, zorder=6) for panel in panels]
+        style: Any = {'transform': plane.transAxes, 'ha': 'right', 'va': 'bottom', 'fontsize': 11}
+        clock = plane.text(1.0, 1.01, '', **style)
+
+        def show(time: float) -> None:
+            for cursor in cursors:
+                cursor.set_xdata([time, time])
+            clock.set_text(f'{time:.1f} s')
+
+        return [*moves, show]
+
+    def _show(self, time: float) -> tuple[()]:
+        for move in self._robots:
+            move(time)
+        return ()
+
+
+def _robot(
+    plane: Any, one: Timeline, times: Array, color: str, inches: float
+) -> Callable[[float], None]:
+    """Draw a robot with the path that it has driven; return a function that moves it to a time.
+
+    Args:
+        plane: The axes.
+        one: The run.
+        times: The times of its odometry on the axis of time, shape (n,) (s).
+        color: Its color.
+        inches: Size of a meter in the plane.
+    """
+    poses, found = one.run.odometry.values[:, :3], size(one.run)
+    driven = plane.plot([], [], color=color, lw=3.5, alpha=0.6, zorder=3.5)[0]
+    if found is None or found.separation * inches < VISIBLE:
+        body = plane.plot([], [], 'o', ms=9, color=color, mec='white', zorder=8)[0]
+        outline = np.zeros((1, 2))
+    else:
+        body = plane.fill([], [], fc=color, ec='black', alpha=0.9, zorder=8)[0]
+        outline = found.separation * sketch.BODY
+
+    def move(time: float) -> None:
+        last = max(int(np.searchsorted(times, time, side='right')) - 1, 0)
+        driven.set_data(*poses[: last + 1, :2].T)
+        corners = sketch.placed(outline, poses[last])
+        if len(outline) == 1:
+            body.set_data(*corners.T)
+        else:
+            body.set_xy(corners)
+
+    return move
