@@ -26,7 +26,8 @@ MOST_FRAMES = 3000
 """Largest number of frames: a film of two and a half minutes."""
 DPI = 90
 """Resolution (dots per inch)."""
-INLINE_FRAMES = 150
+INLINE_DPI = 65
+INLINE_FRAMES = 100
 """Largest number of frames of a film in a notebook, each of which is a picture in it."""
 NO_FFMPEG = 'a film in MP4 needs the program ffmpeg, which is not installed; GIF needs none'
 
@@ -98,7 +99,11 @@ class Film:
 
     def _repr_html_(self) -> str:
         """Return the film for a notebook, with buttons."""
-        with styled():
+        import matplotlib
+
+        # Ten megabytes.
+        smaller: Any = {'savefig.dpi': INLINE_DPI, 'animation.embed_limit': 50.0}
+        with styled(), matplotlib.rc_context(smaller):
             return str(self._animation(min(self.frames, INLINE_FRAMES)).to_jshtml())
 
     def _animation(self, frames: int) -> Any:
