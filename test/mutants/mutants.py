@@ -53,7 +53,7 @@ PACKAGES = (
     *('messages', 'lockstep', 'bags', 'recording'),
     *('nodes', 'ros', 'parameters', 'numerics', 'properties', 'faults', 'exploration', 'testing'),
     'robot_testing',
-    *('tools', 'live', 'plots', 'relations', 'diagnosis'),
+    *('tools', 'live', 'plots', 'relations', 'diagnosis', 'drives'),
 )
 LEFT_OUT = {
     *('test_documents', 'test_explored_nodes', 'test_fastdds_profiles'),
