@@ -58,7 +58,7 @@ def test_the_last_message_is_read_before_the_end_is_heard(recorded):
     """Through a port of its own, discovery was faster in one of six."""
     count, code, output = recorded(10, 5, 300, 10)
     assert (count, code) == (50, 0), output
-    assert 'waiting' not in output
+    assert 'late messages' not in output
 
 
 def test_an_overflow_is_not_called_complete(recorded):
