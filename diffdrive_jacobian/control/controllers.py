@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from diffdrive_jacobian.control.controller import ControlLaw, Controller, PathController
@@ -161,3 +162,13 @@ def find_path_controller(name: str) -> PathController:
 def path_controller_names() -> tuple[str, ...]:
     """Return the names of the built-in and the installed controllers of paths, sorted."""
     return tuple(ALL_PATH_CONTROLLERS)
+
+
+def names_of_gains() -> set[str]:
+    """Return the names of the gains of all installed controllers, of goals and of paths."""
+    found: set[str] = set()
+    for controllers in (CONTROLLERS, ALL_PATH_CONTROLLERS):
+        for name in controllers:
+            with suppress(ControllerError):
+                found.update(controllers.find(name).gain_names)
+    return found

@@ -13,10 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control import Path
+from diffdrive_jacobian.control.controllers import names_of_gains
 from diffdrive_jacobian.control.path_source import is_shape, planned_path
 from diffdrive_jacobian.drives.outcome import DriveProgress, Outcome, Request, waypoints_through
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
+from diffdrive_jacobian.messages.conversion import MAX_POSITION, MAX_WAYPOINTS
+from diffdrive_jacobian.numerics.checks import number, positive_or_infinite, short
+from diffdrive_jacobian.parameters.arguments import unknown
+from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError
+from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
+from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.signals import Signals
 
 if TYPE_CHECKING:
@@ -24,10 +30,13 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.ros.runner import NodeRunner
 
 QUIET = ('--ros-args', '--log-level', 'warn', '--')
+OF_EVERY_NODE = {'use_sim_time', 'start_type_description_service'}
+QOS = 'qos_overrides.'
+"""Beginning of the parameters by which a node of ROS has another quality of service."""
 
 
 def drive(
-    goals: ArrayLike | Path | str,
+    goals: ArrayLike | Path | str | FilePath,
     *,
     relative: bool | None = None,
     controller: str | None = None,
@@ -66,7 +75,8 @@ def drive(
         isolated: Whether no other process can communicate with the nodes. Always so in lockstep.
         timeout: Longest duration, of all goals together (s).
         parameters: Parameters of go_to_goal, by name. They take precedence over `ros_arguments`.
-        robot_parameters: Likewise of virtual_robot.
+        robot_parameters: Likewise of virtual_robot. What wheel_bridge has to know, too, such as the
+            dimensions of the wheels, is given to all by `ros_arguments`.
         recording: The bag to write, or a recording of what the nodes publish, which the caller must
             finish. None: none.
         keep: Whether the outcome has the run. It has none with a runner, and none of a recording that
@@ -92,9 +102,17 @@ def drive(
         raise ValueError('lockstep, isolated and ros_arguments are those of the runner, if one is given')
     if relative is None:
         relative = isinstance(goals, str) and is_shape(goals)
+    if isinstance(ros_arguments, str) or (ros_arguments and ros_arguments[0] != '--ros-args'):
+        raise UserError(
+            f"ros_arguments must be a list that begins with '--ros-args', got {ros_arguments!r}"
+        )
     laws = {'controller': controller, 'path_controller': path_controller}
     chosen = {name: law for name, law in laws.items() if law is not None}
+    of_controller = {**checked_parameters('parameters', parameters), **chosen}
+    of_robot = checked_parameters('robot_parameters', robot_parameters)
     to = as_goals(goals)
+    if path_controller is not None and not (isinstance(to, Path) or of_controller.get('pass_waypoints')):
+        raise ValueError('path_controller has no effect on goals without pass_waypoints')
     with ExitStack() as stack:
         own = None
         if isinstance(recording, (str, FilePath)):
@@ -107,8 +125,8 @@ def drive(
             goals=to,
             relative=relative,
             timeout=timeout,
-            parameters={**(parameters or {}), **chosen},
-            robot_parameters=robot_parameters or {},
+            parameters=of_controller,
+            robot_parameters=of_robot,
             recording=recording,
             keep=keep and recording is None and runner is None,
             signals=signals or Signals(),
@@ -130,7 +148,10 @@ def drive(
 
             if not isolated:
                 raise UserError('other processes need rclpy, which is not installed')
-            outcome = values.drive(request, lockstep=lockstep, ros_arguments=ros_arguments)
+            try:
+                outcome = values.drive(request, lockstep=lockstep, ros_arguments=ros_arguments)
+            except ParameterError as error:
+                raise UserError(str(error)) from error
         if own is not None:
             own.finish()
     if own is None or not keep:
@@ -148,17 +169,57 @@ def has_ros() -> bool:
         return False
 
 
-def as_goals(goals: ArrayLike | Path | str) -> NDArray[np.float64] | Path:
+def checked_parameters(argument: str, given: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the parameters of one node for a drive, with numbers of Python.
+
+    Args:
+        argument: 'parameters' or 'robot_parameters'.
+        given: Values by name; None: none.
+
+    Raises:
+        ValueError: It is no mapping from names.
+        UserError: The node has no parameter of a name.
+    """
+    values = {} if given is None else given
+    if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
+        raise ValueError(f'{argument} must map names of parameters to values, got {short(given, repr)}')
+    nodes: dict[str, tuple[str, NodeParameters]] = {
+        'parameters': ('go_to_goal', GoToGoalParameters()),
+        'robot_parameters': ('virtual_robot', VirtualRobotParameters()),
+    }
+    node, own = nodes.pop(argument)
+    ((place, (other, others)),) = nodes.items()
+    known = own.declared().keys() | (OF_EVERY_NODE if has_ros() else set())
+    for name in (one for one in values if one not in known and not one.startswith(QOS)):
+        if name in others.declared():
+            raise UserError(f'{name!r} is a parameter of {other}: give it in {place}')
+        # Controllers that are installed have parameters once they are chosen.
+        if node == 'virtual_robot' or name not in names_of_gains():
+            raise UserError(f'{node} has no {next(unknown([name], known))}')
+    return {name: one.item() if isinstance(one, np.generic) else one for name, one in values.items()}
+
+
+def as_goals(goals: ArrayLike | Path | str | FilePath) -> NDArray[np.float64] | Path:
     """Return the goals of a drive as poses, shape (n, 3), or as a path.
 
     Raises:
         ValueError: They are none.
     """
-    if isinstance(goals, str):
-        return planned_path(goals)
+    if isinstance(goals, (str, FilePath)):
+        return planned_path(str(goals))
     if isinstance(goals, Path):
         return goals
-    poses = np.asarray(goals, dtype=np.float64)
+    try:
+        poses = np.asarray(goals, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            'goals must be rows [x, y] or [x, y, theta], a path, or its text such as circle:1.0, got '
+            f'{short(goals, repr)}'
+        ) from error
     if poses.ndim != 2 or poses.shape[1] not in (2, 3) or not len(poses):
         raise ValueError(f'goals must have shape (n, 2) or (n, 3) with n > 0, got {poses.shape}')
+    if len(poses) > MAX_WAYPOINTS:
+        raise ValueError(f'goals must be at most {MAX_WAYPOINTS}, got {len(poses)}')
+    if not np.all(np.abs(poses) <= MAX_POSITION):
+        raise ValueError(f'goals must be finite and within {MAX_POSITION:g} m, got {short(goals, repr)}')
     return waypoints_through(poses) if poses.shape[1] == 2 else poses

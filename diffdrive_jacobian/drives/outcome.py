@@ -105,11 +105,11 @@ class Outcome:
 
         return run_figure(self.run)
 
-    def animate(self, speed: float = 1.0) -> Film:
+    def animate(self, speed: float | None = None) -> Film:
         """Return a film of the run, which a notebook shows and `save` writes.
 
         Args:
-            speed: How much faster than it was the film is.
+            speed: How much faster than it was the film is. None: 1, or as a film of a long run needs.
 
         Raises:
             ValueError: The run was not kept, or the speed is not positive or too small.
@@ -121,12 +121,14 @@ class Outcome:
 
     def __repr__(self) -> str:
         """Return the end of the drive in one line."""
-        state = GoalState(self.status).word if self.status in set(GoalState) else str(self.status)
+        state = GoalState(self.status)
+        end = 'interrupted' if self.interrupted else 'timed out'
+        end = state.word if state.ended else end
         where = 'without odometry'
         if self.pose is not None:
             x, y, theta = self.pose
             where = f'at x {x:.3f}, y {y:.3f}, theta {theta:.3f}'
-        return f'Outcome({state} {where}, after {self.seconds:.1f} s)'
+        return f'Outcome({end} {where}, after {self.seconds:.1f} s)'
 
     def _repr_html_(self) -> str:
         """Return the end of the drive and its picture, for notebooks."""

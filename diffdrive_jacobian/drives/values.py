@@ -53,10 +53,11 @@ from diffdrive_jacobian.messages.conversion import (
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.odometry_rate import OdometryRate
 from diffdrive_jacobian.nodes.steering import STANDSTILL, Goal, Pursuit, Steering
-from diffdrive_jacobian.parameters.arguments import check_names, given_parameters, unknown
+from diffdrive_jacobian.parameters.arguments import check_names, given_parameters
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
+from diffdrive_jacobian.parameters.wheels import SAME_WHEELS, different_wheels
 from diffdrive_jacobian.simulation.actuators import ramp
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.simulation.speeds import Profile
@@ -414,9 +415,9 @@ class World:
         self.speeds = (0.0, 0.0)
         self._queue: list[tuple[str, Any]] = []
         given = given_parameters(ros_arguments, NODES)
-        wheels = {'command_interface': 'wheels'}
+        interface = {'command_interface': 'wheels'}
         values = {
-            '/virtual_robot': {**given['/virtual_robot'], **request.robot_parameters, **wheels},
+            '/virtual_robot': {**given['/virtual_robot'], **request.robot_parameters, **interface},
             '/wheel_bridge': given['/wheel_bridge'],
             '/go_to_goal': {**given['/go_to_goal'], **request.parameters},
         }
@@ -432,8 +433,9 @@ class World:
         """Values of the parameters by the names of the nodes."""
         known = {name for one in self.parameters.values() for name in one}
         check_names(ros_arguments, known)
-        for text in unknown({**request.robot_parameters, **request.parameters}, known):
-            LOG.warning('unknown %s', text)
+        wheels = of_bridge.dimensions, 'virtual_robot', of_robot.dimensions
+        if found := different_wheels(*wheels):
+            LOG.warning('%s; %s', found, SAME_WHEELS)
         self.robot = DrivenRobot(of_robot, self.now, self._publish)
         self.bridge = Bridge(of_bridge, self._publish)
         self.driver = Driver(of_driver, self._publish)

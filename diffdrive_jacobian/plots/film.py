@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.bags.timeline import Array, Timeline, timeline
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.numerics.checks import number, positive
 from diffdrive_jacobian.plots import run_panels, sketch
-from diffdrive_jacobian.plots.output_files import FILM_FORMATS, extension
+from diffdrive_jacobian.plots.output_files import FILM_FORMATS, check_directory, extension
 from diffdrive_jacobian.plots.rendering import styled
-from diffdrive_jacobian.plots.run_pictures import COLORS, run_figure
+from diffdrive_jacobian.plots.run_pictures import COLORS, as_runs, run_figure
 from diffdrive_jacobian.plots.run_plane import VISIBLE, size
 
 RATE = 20
@@ -29,6 +29,11 @@ DPI = 90
 INLINE_DPI = 65
 INLINE_FRAMES = 100
 """Largest number of frames of a film in a notebook, each of which is a picture in it."""
+BUTTONS = {
+    **{'minus': '-', 'fast-backward': '|<', 'step-backward': '<', 'play fa-flip-horizontal': 'back'},
+    **{'pause': 'pause', 'play': 'play', 'step-forward': '>', 'fast-forward': '>|', 'plus': '+'},
+}
+"""Icons of the buttons of matplotlib, and what they are here."""
 NO_FFMPEG = 'a film in MP4 needs the program ffmpeg, which is not installed; GIF needs none'
 
 
@@ -40,31 +45,34 @@ class Film:
         seconds: Its duration (s).
     """
 
-    def __init__(self, runs: Run | Sequence[Run], *, speed: float = 1.0) -> None:
+    def __init__(self, runs: Any, *, speed: float | None = None) -> None:
         """Draw the figure of the runs, into which each frame puts the robots.
 
         Args:
             runs: As for `run_figure`.
-            speed: How much faster than it was the film is.
+            speed: How much faster than it was the film is. None: 1, or as a long run needs.
 
         Raises:
             ValueError: The speed is not positive, or so small that there are more than `MOST_FRAMES`.
             BagError, ModuleNotFoundError: As for `run_figure`.
         """
-        number('speed', speed, positive)
-        runs = [runs] if isinstance(runs, Run) else runs
+        if speed is not None:
+            number('speed', speed, positive)
+        runs = as_runs(runs)
         self._timelines = [timeline(run) for run in runs]
         zeros = map(run_panels.zero, self._timelines)
         self._times = [
             np.maximum.accumulate(one.time) - zero
             for one, zero in zip(self._timelines, zeros, strict=True)
         ]
-        first, last = run_panels.window(self._timelines)
+        first = min(run_panels.beginning(one) for one in self._timelines)
+        last = max(float(times[-1]) for times in self._times)
+        least = (last - first) * RATE / (MOST_FRAMES - 2)
+        speed = max(1.0, least) if speed is None else speed
+        if speed < least:
+            raise ValueError(f'speed must be at least {least:.3g} for such a long run, got {speed:g}')
         self.seconds = (last - first) / speed
         self.frames = int(self.seconds * RATE) + 2
-        if self.frames > MOST_FRAMES:
-            least = (last - first) * RATE / MOST_FRAMES
-            raise ValueError(f'speed must be at least {least:.3g} for such a long run, got {speed:g}')
         self._shown = np.linspace(first, last, self.frames)
         self._figure = run_figure(runs)
         self._robots = self._draw()
@@ -80,7 +88,10 @@ class Film:
             UserError: The file has another ending, or there is no ffmpeg for an MP4.
             OSError: It cannot be written.
         """
-        Path(path).write_bytes(self.content(extension(Path(path)), progress))
+        file = Path(path)
+        # Before it takes a while.
+        check_directory(file.parent)
+        file.write_bytes(self.content(extension(file), progress))
 
     def content(self, ending: str, progress: Callable[[int, int], object] | None = None) -> bytes:
         """Return the content of a file of one of the `FILM_FORMATS`; the rest as for `save`."""
@@ -104,7 +115,10 @@ class Film:
         # Ten megabytes.
         smaller: Any = {'savefig.dpi': INLINE_DPI, 'animation.embed_limit': 50.0}
         with styled(), matplotlib.rc_context(smaller):
-            return str(self._animation(min(self.frames, INLINE_FRAMES)).to_jshtml())
+            page: str = self._animation(min(self.frames, INLINE_FRAMES)).to_jshtml()
+        # Its buttons are icons that are loaded from elsewhere: these are letters.
+        page = re.sub('<link[^>]*>', '', page)
+        return re.sub('<i class="fa fa-([^"]*)"></i>', lambda icon: BUTTONS.get(icon[1], icon[1]), page)
 
     def _animation(self, frames: int) -> Any:
         from matplotlib.animation import FuncAnimation
@@ -154,10 +168,10 @@ def _robot(
     poses, found = one.run.odometry.values[:, :3], size(one.run)
     driven = plane.plot([], [], color=color, lw=3.5, alpha=0.6, zorder=3.5)[0]
     if found is None or found.separation * inches < VISIBLE:
-        body = plane.plot([], [], 'o', ms=9, color=color, mec='white', zorder=8)[0]
+        body = plane.plot([], [], 'o', ms=9, color=color, mec='white', zorder=8, clip_on=False)[0]
         outline = np.zeros((1, 2))
     else:
-        body = plane.fill([], [], fc=color, ec='black', alpha=0.9, zorder=8)[0]
+        body = plane.fill([], [], fc=color, ec='black', alpha=0.8, zorder=8, clip_on=False)[0]
         outline = found.separation * sketch.BODY
 
     def move(time: float) -> None:

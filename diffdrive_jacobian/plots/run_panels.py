@@ -95,14 +95,17 @@ def zero(one: Timeline) -> float:
     return 0.0 if np.isnan(one.start) else one.start
 
 
+def beginning(one: Timeline) -> float:
+    """Return the first time at which something happens: the first goal, or motion before it (s)."""
+    places = one.run.odometry.values[:, :2]
+    # Time may go back.
+    moved = one.time[np.hypot(*(places - places[0]).T) > MOTION]
+    return float(np.min(moved, initial=zero(one))) - zero(one)
+
+
 def window(timelines: Sequence[Timeline]) -> tuple[float, float]:
     """Return the ends of the axis of time (s), without the waiting for the first goal."""
-    begins = []
-    for one in timelines:
-        places = one.run.odometry.values[:, :2]
-        # Time may go back.
-        moved = one.time[np.hypot(*(places - places[0]).T) > MOTION]
-        begins.append(float(np.min(moved, initial=zero(one))) - zero(one))
+    begins = [*map(beginning, timelines)]
     ends = [max(float(np.max(one.time)) - zero(one), 0.0) for one in timelines]
     margin = 0.02 * max(max(ends) - min(begins), STILL)
     return min(begins) - margin, max(ends) + margin

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import textwrap
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ import numpy as np
 from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.bags.summary import RunSummary, summary
 from diffdrive_jacobian.bags.timeline import Timeline, timeline
+from diffdrive_jacobian.numerics.checks import short
 from diffdrive_jacobian.plots import run_panels
 from diffdrive_jacobian.plots.rendering import picture
 from diffdrive_jacobian.plots.run_layout import GREY, Texts, arrange, lay_out
@@ -39,14 +40,14 @@ STYLES: tuple[Any, ...] = ('-', (0, (5, 1.5)), '-.', (0, (1.2, 1)), (0, (7, 1.5,
 
 
 @picture
-def run_figure(runs: Run | Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Figure:
+def run_figure(runs: Any, violations: Sequence[ViolationMark] = ()) -> Figure:
     """Return a figure of one or several runs. The plane is the first of its axes.
 
     Time counts from the first goal or path of each run. A single run is drawn with its commands, the
     changes of its goals, its faults, and the uncertainty along its path, see `plots.uncertainty`.
 
     Args:
-        runs: They must have odometry. `read_run` reads them.
+        runs: A `Run` or several, or what has one, as the outcome of a drive. They must have odometry.
         violations: Violated properties of a single run.
 
     Raises:
@@ -57,7 +58,7 @@ def run_figure(runs: Run | Sequence[Run], violations: Sequence[ViolationMark] = 
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    runs = [runs] if isinstance(runs, Run) else runs
+    runs = as_runs(runs)
     if not runs:
         raise ValueError('runs must have at least one run, got none')
     timelines = [timeline(run) for run in runs]
@@ -98,6 +99,21 @@ def run_figure(runs: Run | Sequence[Run], violations: Sequence[ViolationMark] = 
     texts = Texts(header, samples, marks, _notes(runs, labels))
     lay_out(drawing, axes, others, arrangement, texts, _time_label(timelines))
     return drawing
+
+
+def as_runs(given: Any) -> list[Run]:
+    """Return runs of a `Run`, of what has one (`run`), or of several of them.
+
+    Raises:
+        ValueError: Something else was given.
+    """
+    several = [given] if isinstance(given, Run) or hasattr(given, 'run') else given
+    if not isinstance(several, Iterable):
+        raise ValueError(f'runs must be a Run or several, got {short(given, repr)}')
+    found: list[Any] = [one if isinstance(one, Run) else getattr(one, 'run', None) for one in several]
+    if not all(isinstance(one, Run) for one in found):
+        raise ValueError(f'runs must be a Run or several, got {short(given, repr)}')
+    return found
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:

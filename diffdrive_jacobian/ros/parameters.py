@@ -150,6 +150,7 @@ def report_unknown(nodes: Sequence[Node], others: Iterable[Node] = ()) -> None:
     if not unknown:
         return
     # Slow to import.
+    from diffdrive_jacobian.control.controllers import names_of_gains
     from diffdrive_jacobian.parameters.nodes import NODE_PARAMETERS
 
     ours = {name for one in NODE_PARAMETERS for name in one.declared()}
@@ -163,7 +164,7 @@ def report_unknown(nodes: Sequence[Node], others: Iterable[Node] = ()) -> None:
             continue
         meant = ' or '.join(f"'{one}'" for one in sorted(close))
         hint = f'did you mean {meant}?' if close else f'see {" or ".join(programs)}'
-        if name in given and name not in _later_gains():
+        if name in given and name not in names_of_gains():
             raise ParameterError(f"no node of this program has the parameter '{name}'; {hint}")
         node.get_logger().warning(f"unknown parameter '{name}' is ignored; {hint}")
 
@@ -178,20 +179,3 @@ def _resembling(name: str, known: Sequence[str]) -> list[str]:
     if not close and len(name) <= SHORT:
         close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
     return close
-
-
-def _later_gains() -> set[str]:
-    """Return the gains of all installed controllers, which are declared when one is chosen."""
-    # Slow to import.
-    from diffdrive_jacobian.control.controllers import (
-        ALL_PATH_CONTROLLERS,
-        CONTROLLERS,
-        ControllerError,
-    )
-
-    found: set[str] = set()
-    for controllers in (CONTROLLERS, ALL_PATH_CONTROLLERS):
-        for name in controllers:
-            with suppress(ControllerError):
-                found.update(controllers.find(name).gain_names)
-    return found

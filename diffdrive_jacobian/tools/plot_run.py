@@ -66,7 +66,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         _output.write(picture, content, replace=options.force)
         _output.say(picture)
     if film is not None:
-        _output.write(film, _filmed(runs, film, options.speed or 1.0, signals), replace=options.force)
+        _output.write(film, _filmed(runs, film, options.speed, signals), replace=options.force)
         _output.say(film)
     for run, path in zip(runs, tables, strict=bool(tables)):
         _output.check(signals)
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     return DONE
 
 
-def _filmed(runs: Sequence[Run], path: Path, speed: float, signals: Signals) -> bytes:
+def _filmed(runs: Sequence[Run], path: Path, speed: float | None, signals: Signals) -> bytes:
     """Return the content of a file with a film, with a progress bar.
 
     Raises:
@@ -203,7 +203,9 @@ def _parser() -> _cli.Parser:
         metavar='FILE',
         help=f'write a film, .{", .".join(FILM_FORMATS)}, and a picture only with -o; MP4 needs ffmpeg',
     )
-    parser.add_value('--speed', 'X', 'how much faster than it was the film is (default: 1)')
+    parser.add_value(
+        '--speed', 'X', 'how much faster than it was the film is (default: 1, or more for a long run)'
+    )
     parser.add_force('the picture, the film and the tables')
     parser.add_namespace()
     parser.add_argument(

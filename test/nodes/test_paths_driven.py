@@ -54,7 +54,8 @@ def test_a_robot_that_takes_time_stops_at_the_end():
 def test_how_late_a_robot_is_that_is_too_slow_for_a_trajectory_is_said_everywhere(tmp_path, capfd):
     recording, slow = Recording(tmp_path / 'slow', lossless=True), {'linear.x.max_velocity': 0.2}
     trajectory = line_path(1.0).timed(0.5)
-    outcome = drive(trajectory, lockstep=True, robot_parameters=slow, recording=recording)
+    how = {'robot_parameters': slow, 'ros_arguments': ['--ros-args', '--log-level', 'info']}
+    outcome = drive(trajectory, lockstep=True, recording=recording, **how)
     recording.finish()
     one = timeline(read_run(tmp_path / 'slow'))
     assert outcome.arrived

@@ -14,6 +14,7 @@ from diffdrive_jacobian.drives import drive, driving, nodes, values
 from diffdrive_jacobian.drives.driving import as_goals
 from diffdrive_jacobian.drives.outcome import Outcome, Request
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.signals import Signals
 
 pytestmark = pytest.mark.slow
@@ -154,11 +155,44 @@ def test_real_time_passes():
     assert slow.seconds == pytest.approx(0.3, abs=0.03)
 
 
-def test_unknown_parameters_are_named(caplog):
-    values.drive(request(TO, timeout=0.1, parameters={'kpp': 1.0}), lockstep=True)
-    assert "unknown parameter 'kpp'; did you mean 'kp'?" in caplog.text
-    with pytest.raises(UserError, match="parameter 'kpp'; did you mean 'kp'"):
-        values.drive(request(TO), lockstep=True, ros_arguments=['-p', 'kpp:=1'])
+WRONG = [
+    ({'parameters': {'kpp': 3.0}}, UserError, "go_to_goal has no parameter 'kpp'; did you mean 'kp'?"),
+    ({'parameters': {'wheel_radius': 0.1}}, UserError, 'virtual_robot: give it in robot_parameters'),
+    ({'robot_parameters': {'kp': 3.0}}, UserError, 'go_to_goal: give it in parameters'),
+    ({'robot_parameters': {'x_': 3.0}}, UserError, "virtual_robot has no parameter 'x_'"),
+    ({'parameters': {'kp': 'x'}}, UserError, "'kp' must be"),
+    ({'parameters': ['kp', 3]}, ValueError, 'parameters must map names'),
+    ({'robot_parameters': {3: 3}}, ValueError, 'robot_parameters must map names'),
+    ({'path_controller': 'kanayama'}, ValueError, 'path_controller has no effect on goals'),
+    ({'ros_arguments': ['-p', 'kp:=3']}, UserError, "that begins with '--ros-args'"),
+    ({'ros_arguments': '--ros-args -p kp:=3'}, UserError, "that begins with '--ros-args'"),
+    ({'ros_arguments': ['--ros-args', '-p', 'kpp:=1']}, UserError, "parameter 'kpp'; did you mean 'kp'"),
+    ({'goals': [[math.nan, 1.0]]}, ValueError, 'goals must be finite'),
+    ({'goals': [[1e9, 1.0]]}, ValueError, 'within 1e\\+06 m'),
+    ({'goals': np.zeros((2001, 2))}, ValueError, 'goals must be at most 2000'),
+    ({'goals': zip([1.0], [2.0], strict=True)}, ValueError, r'goals must be rows \[x, y\]'),
+    ({'goals': [['a', 'b']]}, ValueError, r'goals must be rows \[x, y\]'),
+]
+
+
+@pytest.mark.parametrize('ros', [True, False])
+@pytest.mark.parametrize(('given', 'error', 'words'), WRONG)
+def test_what_would_have_no_effect_or_is_wrong_is_refused_before_the_drive(
+    monkeypatch, tmp_path, ros, given, error, words
+):
+    monkeypatch.setattr(driving, 'has_ros', lambda: ros)
+    with pytest.raises(error, match=words):
+        drive(**{'goals': TO, 'lockstep': True, **given})
+
+
+def test_numbers_of_numpy_and_wheels_that_differ(monkeypatch, caplog):
+    monkeypatch.setattr(driving, 'has_ros', lambda: False)
+    how = {'lockstep': True, 'timeout': 0.1}
+    one, two = (drive(TO, parameters={'kp': kp}, **how) for kp in (np.int64(3), np.float32(3.0)))
+    assert one.run.parameters == two.run.parameters
+    assert not caplog.text
+    drive(TO, robot_parameters={'wheel_radius': 0.05}, **how)
+    assert 'virtual_robot has wheel_radius 0.05 m instead of 0.033 m' in caplog.text
 
 
 def test_the_bag_has_the_run(tmp_path, monkeypatch):
@@ -186,6 +220,11 @@ def test_an_outcome_shows_its_run():
     assert outcome.run.parameters['/go_to_goal']['controller'] == 'offset_point'
     assert outcome.plot().axes
     assert 'data:image/svg+xml;base64,' in outcome._repr_html_()
+    assert 'timed out at' in repr(outcome)
+    assert run_figure([outcome, outcome.run]).axes
+    for wrong in (3, [3], 'run'):
+        with pytest.raises(ValueError, match='runs must be a Run or several, got'):
+            run_figure(wrong)
     with pytest.raises(ValueError, match='the run was not kept'):
         replace(outcome, kept=None).plot()
 
