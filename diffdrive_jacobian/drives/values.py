@@ -29,6 +29,7 @@ from diffdrive_jacobian.drives.outcome import (
     Request,
 )
 from diffdrive_jacobian.drives.recorded import ValueRecorder
+from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.messages.codecs import (
     GOALS,
@@ -66,6 +67,8 @@ from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 START = NANOSECONDS
 """Time at the start, as in lockstep (ns)."""
 NODES = ('/virtual_robot', '/wheel_bridge', '/go_to_goal')
+OF_MESSAGES = {'enable_stamped_cmd_vel', 'joint_command_type'}
+"""Parameters that would have no effect."""
 LONGEST_STEP = NANOSECONDS
 """Largest advance of the time, as in lockstep (ns)."""
 Publish = Callable[[str, Any], None]
@@ -433,6 +436,10 @@ class World:
         """Values of the parameters by the names of the nodes."""
         known = {name for one in self.parameters.values() for name in one}
         check_names(ros_arguments, known)
+        for node in (of_robot, of_bridge, of_driver):
+            for name in OF_MESSAGES & node.declared().keys():
+                if node.by_name()[name] != node.declared()[name].default:
+                    raise UserError(f'{name} chooses a type of messages, and needs rclpy')
         wheels = of_bridge.dimensions, 'virtual_robot', of_robot.dimensions
         if found := different_wheels(*wheels):
             LOG.warning('%s; %s', found, SAME_WHEELS)

@@ -31,7 +31,7 @@ INLINE_FRAMES = 100
 """Largest number of frames of a film in a notebook, each of which is a picture in it."""
 BUTTONS = {
     **{'minus': '-', 'fast-backward': '|<', 'step-backward': '<', 'play fa-flip-horizontal': 'back'},
-    **{'pause': 'pause', 'play': 'play', 'step-forward': '>', 'fast-forward': '>|', 'plus': '+'},
+    **{'pause': '||', 'play': 'play', 'step-forward': '>', 'fast-forward': '>|', 'plus': '+'},
 }
 """Icons of the buttons of matplotlib, and what they are here."""
 NO_FFMPEG = 'a film in MP4 needs the program ffmpeg, which is not installed; GIF needs none'

@@ -185,6 +185,14 @@ def test_what_would_have_no_effect_or_is_wrong_is_refused_before_the_drive(
         drive(**{'goals': TO, 'lockstep': True, **given})
 
 
+@pytest.mark.parametrize(
+    'rule', ['enable_stamped_cmd_vel:=true', 'joint_command_type:=Float64MultiArray']
+)
+def test_parameters_of_messages_are_refused_where_there_are_none(rule):
+    with pytest.raises(UserError, match='chooses a type of messages, and needs rclpy'):
+        values.drive(request(TO), lockstep=True, ros_arguments=['--ros-args', '-p', rule])
+
+
 def test_numbers_of_numpy_and_wheels_that_differ(monkeypatch, caplog):
     monkeypatch.setattr(driving, 'has_ros', lambda: False)
     how = {'lockstep': True, 'timeout': 0.1}
