@@ -18,8 +18,9 @@ from rclpy.node import Node
 from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.drives.nodes import DISCOVERY_PERIOD as RECORDED_PERIOD
 from diffdrive_jacobian.drives.nodes import add_nodes, in_lockstep, in_real_time, recorder_of
-from diffdrive_jacobian.live.commands import Command, Pause, RobotCommand, SetSpeed, Step
+from diffdrive_jacobian.live.commands import Command, RobotCommand
 from diffdrive_jacobian.live.live_robot import LiveRobot
+from diffdrive_jacobian.live.pacing import Pacing, control_time
 from diffdrive_jacobian.live.robot_state import GoalEnd
 from diffdrive_jacobian.live.server import LiveServer, Ready
 from diffdrive_jacobian.live.session import Session, Snapshot
@@ -44,76 +45,8 @@ MAX_ROBOTS = 16
 """Largest number of robots that are shown."""
 LOST = 30.0
 """Time without odometry and publisher after which a robot is no longer shown (s)."""
-NAP = 0.02
-"""Longest time for which `pace` waits before it looks at commands again (s)."""
 RECORDED_AFTER = 1.5 * RECORDED_PERIOD
 """Time after which the recorder has found the publishers of the page (s)."""
-MAX_LAG = 0.1
-"""Time that is made up for at most (s). A machine that is too slow shows time as it comes."""
-
-
-class Pacing:
-    """Decides when simulated time may advance."""
-
-    def __init__(self, *, speed: float = 1.0, paused: bool = False) -> None:
-        """Start at a speed relative to the clock on the wall."""
-        self.speed, self.paused = speed, paused
-        self._steps = 0
-        self._simulated = self._wait = 0.0
-        self._anchor: tuple[float, float] | None = None
-
-    def now(self) -> float:
-        """Return the simulated time at which it was asked last whether time may advance (s)."""
-        return self._simulated
-
-    def obey(self, command: Pause | Step | SetSpeed) -> None:
-        """Do what a page asks for."""
-        self._anchor = None
-        if isinstance(command, Pause):
-            self.paused = command.paused
-        elif isinstance(command, Step):
-            self.paused = True
-            self._steps += 1
-        else:
-            self.speed = command.speed
-
-    def may_advance(self, simulated: float, now: float) -> bool:
-        """Return whether time may advance beyond a simulated time, at a time on the wall (s)."""
-        self._simulated = simulated
-        if self.paused:
-            self._anchor = None
-            if not self._steps:
-                return False
-            self._steps -= 1
-            return True
-        if self._anchor is None:
-            self._anchor = simulated, now
-        lag = (now - self._anchor[1]) * self.speed - (simulated - self._anchor[0])
-        if lag > MAX_LAG * self.speed:
-            self._anchor = simulated, now
-        self._wait = -lag / self.speed
-        return lag >= 0.0
-
-    def pace(self, simulated: float, meanwhile: Callable[[], bool]) -> bool:
-        """Wait until time may advance beyond a simulated time (s), or `meanwhile` returns True.
-
-        Returns:
-            Whether `meanwhile` ended the wait.
-        """
-        while not self.may_advance(simulated, time.monotonic()):
-            if meanwhile():
-                return True
-            time.sleep(NAP if self.paused else min(NAP, max(0.0, self._wait)))
-        return False
-
-    def shown(self) -> dict[str, Any]:
-        """Return what the page shows."""
-        return {
-            'kind': 'lockstep',
-            'time': round(self._simulated, 3),
-            'paused': self.paused,
-            'speed': self.speed,
-        }
 
 
 class LivePage(Node):  # type: ignore[misc]
@@ -203,13 +136,7 @@ class LivePage(Node):  # type: ignore[misc]
 
     def _obey(self, page: int, command: Command) -> None:
         if not isinstance(command, RobotCommand):
-            if self._pacing is not None and isinstance(command, (Pause, Step, SetSpeed)):
-                self._pacing.obey(command)
-            else:
-                text = 'time is real here: it can neither pause nor change its speed'
-                if self._pacing is not None:
-                    text = 'only a recording has times to go to'
-                self._session.notify(text, 'warning')
+            control_time(self._session, self._pacing, command)
             return
         robot = self.robots.get(command.robot)
         if robot is None:

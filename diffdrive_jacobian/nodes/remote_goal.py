@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control import Arrival, Path
-from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, driven_offset
 from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
+from diffdrive_jacobian.parameters.chosen_law import ignores_heading
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.runner import NodeRunner, ros_context, running
 from diffdrive_jacobian.ros.service_client import Liveness
@@ -420,19 +420,6 @@ class _Session:
             reason=reason,
             canceled=canceled,
         )
-
-
-def ignores_heading(values: Mapping[str, Any]) -> bool:
-    """Return whether a controller with these `HEADING_PARAMETERS` ignores the heading of goals.
-
-    Other controllers than the built-in ones may take it.
-    """
-    controller = CONTROLLERS.built_in.get(str(values.get('controller')))
-    return (
-        values.get('use_goal_heading') is False
-        and controller is not None
-        and not controller.takes_heading
-    )
 
 
 def loss(sent_to: Mapping[bytes, str], present: Mapping[bytes, str], silence: float) -> str | None:

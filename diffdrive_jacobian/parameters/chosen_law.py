@@ -42,6 +42,19 @@ def chosen_law(parameters: Mapping[str, Any], *, path: bool = False) -> ChosenLa
     return ChosenLaw(name[:64], law, gains, values)
 
 
+def ignores_heading(values: Mapping[str, Any]) -> bool:
+    """Return whether a controller with these parameters ignores the heading of goals.
+
+    Other controllers than the built-in ones may take it.
+    """
+    controller = CONTROLLERS.built_in.get(str(values.get('controller')))
+    return (
+        values.get('use_goal_heading') is False
+        and controller is not None
+        and not controller.takes_heading
+    )
+
+
 def _number(value: object) -> float:
     # Other recorders may store 3 for 3.0.
     number = isinstance(value, (int, float)) and not isinstance(value, bool)

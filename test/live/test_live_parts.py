@@ -22,7 +22,7 @@ from diffdrive_jacobian.live.commands import (
     parse,
 )
 from diffdrive_jacobian.live.hand import CANCEL_PATIENCE, DEAD_MAN, Act, HandDriving
-from diffdrive_jacobian.live.node import Pacing
+from diffdrive_jacobian.live.pacing import Pacing
 from diffdrive_jacobian.live.robot_state import Trail
 from diffdrive_jacobian.live.server import page_files
 from diffdrive_jacobian.live.session import MAX_COMMANDS, MAX_NOTICES, Session, Snapshot
