@@ -31,6 +31,7 @@ from diffdrive_jacobian.live.commands import (
 from diffdrive_jacobian.live.hand import DEAD_MAN, STANDSTILL, Act, HandDriving
 from diffdrive_jacobian.live.robot_state import GoalEnd, RobotState
 from diffdrive_jacobian.live.session import Session
+from diffdrive_jacobian.live.settings import Range
 from diffdrive_jacobian.messages.codecs import Route, Status
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import GoalState
@@ -304,6 +305,6 @@ class SteeredRobot(ABC):
         """Return the settings for the page."""
         return self.state.settings(self.ranges(), imported=True)
 
-    def ranges(self) -> Mapping[str, Mapping[str, settings.Range]]:
+    def ranges(self) -> Mapping[str, Mapping[str, Range]]:
         """Return the ranges that the nodes serve, by role. Those of this package need none."""
         return {}

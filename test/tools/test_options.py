@@ -25,9 +25,9 @@ from diffdrive_jacobian.drives import in_lockstep
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.remote_goal import send_goal
-from diffdrive_jacobian.parameters.chosen_law import ignores_heading
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters import file as configuration_files
+from diffdrive_jacobian.parameters.chosen_law import ignores_heading
 from diffdrive_jacobian.parameters.file import configurations
 from diffdrive_jacobian.plots import rendering
 from diffdrive_jacobian.recording import NothingToPlayError, Playback
