@@ -20,7 +20,7 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.conversion import MAX_POSITION, MAX_WAYPOINTS
 from diffdrive_jacobian.numerics.checks import number, positive_or_infinite, short
 from diffdrive_jacobian.parameters.arguments import unknown
-from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError
+from diffdrive_jacobian.parameters.declaration import NodeParameters
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.signals import Signals
@@ -148,10 +148,7 @@ def drive(
 
             if not isolated:
                 raise UserError('other processes need rclpy, which is not installed')
-            try:
-                outcome = values.drive(request, lockstep=lockstep, ros_arguments=ros_arguments)
-            except ParameterError as error:
-                raise UserError(str(error)) from error
+            outcome = values.drive(request, lockstep=lockstep, ros_arguments=ros_arguments)
         if own is not None:
             own.finish()
     if own is None or not keep:

@@ -19,11 +19,11 @@ from rosbags.interfaces import (
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
 from diffdrive_jacobian.bags.message_definitions import known_definition, known_structure
 from diffdrive_jacobian.messages.cdr import Writer
-from diffdrive_jacobian.messages.codecs import Route, Status
+from diffdrive_jacobian.messages.codecs import Changes, Route, Status
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.structure import blank
 from diffdrive_jacobian.messages.topics import TOPICS
-from diffdrive_jacobian.time_units import nanoseconds
+from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.recording.recording import Recording
@@ -52,7 +52,7 @@ class ValueRecorder:
 
     def _open(self, name: str, number: int) -> Callable[[Any], bytes]:
         """Record that there is a topic; return what serializes its messages."""
-        codec = TOPICS[name].codecs[0]
+        codec = (TOPICS.get(name) or TOPICS[f'/{name}']).codecs[0]
         described = known_definition(codec.type_name)
         self._recording.add(
             Channel(
@@ -73,7 +73,7 @@ class ValueRecorder:
         """Fill in the strings of a message, and the lengths of its sequences."""
         robot = self._of_robot
         frames = {'ground_truth': 'ground_truth_frame_id', 'cmd_vel_out': 'base_frame_id'}
-        if name in ('odom', 'ground_truth', 'start_pose', 'cmd_vel_out'):
+        if name in ('odom', 'ground_truth', 'start_pose', 'initialpose', 'cmd_vel_out'):
             message.header.frame_id = robot[frames.get(name, 'odom_frame_id')]
         if name in ('odom', 'ground_truth'):
             message.child_frame_id = robot['base_frame_id']
@@ -132,4 +132,30 @@ def _status(status: Status) -> bytes:
     return Writer(message, (), kind=kind)(())
 
 
-_WRITERS: dict[str, Callable[[Any], bytes]] = {'goals': _goals, 'path': _path, 'goal_status': _status}
+def _changes(changes: Changes) -> bytes:
+    kind = known_structure('rcl_interfaces/msg/ParameterEvent')
+    message = blank(kind)
+    message.stamp.sec, message.stamp.nanosec = divmod(changes.stamp, NANOSECONDS)
+    message.node = changes.node
+    for name, value in changes.values.items():
+        parameter = blank(known_structure('rcl_interfaces/msg/Parameter'))
+        field, parameter.value.type = _FIELDS[type(value)]
+        parameter.name = name
+        setattr(parameter.value, field, value)
+        message.changed_parameters.append(parameter)
+    return Writer(message, (), kind=kind)(())
+
+
+_FIELDS: dict[type, tuple[str, int]] = {
+    bool: ('bool_value', 1),
+    int: ('integer_value', 2),
+    float: ('double_value', 3),
+    str: ('string_value', 4),
+}
+"""Fields of a ParameterValue, and the constants of their types in rcl_interfaces/msg/ParameterType."""
+_WRITERS: dict[str, Callable[[Any], bytes]] = {
+    'goals': _goals,
+    'path': _path,
+    'goal_status': _status,
+    'parameter_events': _changes,
+}

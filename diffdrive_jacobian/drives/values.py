@@ -11,9 +11,9 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,41 +28,25 @@ from diffdrive_jacobian.drives.outcome import (
     Outcome,
     Request,
 )
+from diffdrive_jacobian.drives.read_values import as_read, read_state
 from diffdrive_jacobian.drives.recorded import ValueRecorder
+from diffdrive_jacobian.drives.value_nodes import Bridge, DrivenRobot, Driver
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.messages.codecs import (
-    GOALS,
-    ODOMETRY,
-    ODOMETRY_STATE,
-    PATH,
-    Command,
-    Motion,
-    Place,
-    Route,
-    State,
-    Status,
-    Wheels,
-)
-from diffdrive_jacobian.messages.conversion import (
-    MessageError,
-    command_time,
-    from_pose,
-    from_twist,
-    plausible_twist,
-)
+from diffdrive_jacobian.messages.codecs import Changes, Command, Motion, Route
+from diffdrive_jacobian.messages.conversion import MessageError, from_twist
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.nodes.odometry_rate import OdometryRate
-from diffdrive_jacobian.nodes.steering import STANDSTILL, Goal, Pursuit, Steering
+from diffdrive_jacobian.nodes.steering import STANDSTILL
 from diffdrive_jacobian.parameters.arguments import check_names, given_parameters
+from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
 from diffdrive_jacobian.parameters.wheels import SAME_WHEELS, different_wheels
-from diffdrive_jacobian.simulation.actuators import ramp
-from diffdrive_jacobian.simulation.robot import Robot
-from diffdrive_jacobian.simulation.speeds import Profile
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.recording.recording import Recording
 
 START = NANOSECONDS
 """Time at the start, as in lockstep (ns)."""
@@ -71,265 +55,50 @@ OF_MESSAGES = {'enable_stamped_cmd_vel', 'joint_command_type'}
 """Parameters that would have no effect."""
 LONGEST_STEP = NANOSECONDS
 """Largest advance of the time, as in lockstep (ns)."""
-Publish = Callable[[str, Any], None]
-"""Receives the topic and the value of a message."""
 LOG = logging.getLogger(__name__)
-
-
-class Deadline:
-    """The time at which an input has stayed away for too long, as `ros.watchdog.Watchdog` has it."""
-
-    def __init__(self, timeout: float) -> None:
-        """Wait for nothing until it is fed. The timeout is in s; 0: it never expires."""
-        self.at = math.inf
-        """When to look (ns); infinity: nothing is waited for."""
-        self._timeout = nanoseconds(timeout)
-        self._fed = 0
-
-    def feed(self, now: int) -> None:
-        """Restart the timeout at a time (ns)."""
-        self._fed = now
-        if self._timeout and self.at == math.inf:
-            self.at = now + self._timeout
-
-    def stop(self) -> None:
-        """Wait for nothing until it is fed again."""
-        self.at = math.inf
-
-    def expires(self, now: int) -> bool:
-        """Return whether the timeout is over at a time (ns), and then wait for nothing."""
-        if now < self.at:
-            return False
-        end = self._fed + self._timeout
-        self.at = end if now < end else math.inf
-        return now >= end
-
-
-class DrivenRobot:
-    """What the node virtual_robot does, driven by its wheels."""
-
-    def __init__(self, parameters: VirtualRobotParameters, now: int, publish: Publish) -> None:
-        """Place it at the pose of its parameters, at a time (ns)."""
-        place = np.array([parameters.x, parameters.y, se2.wrap_angle(parameters.theta)])
-        self.parameters = parameters
-        self._robot = Robot(model=parameters.model(), stamp=now, pose=place)
-        self._publish = publish
-        self._names = parameters.wheel_names
-        self._interval = 1.0 / parameters.publish_rate
-        # As rclpy has timers: the period is rounded down, and a clock that starts later skips some.
-        self._period = int(self._interval * NANOSECONDS)
-        self.next = (now // self._period + 1) * self._period
-        """When it publishes next (ns)."""
-        robot = self._robot
-        publish('start_pose', Place(robot.stamp, robot.pose_tuple, robot.covariance_tuple))
-
-    def true_pose(self, now: int) -> NDArray[np.float64]:
-        """Return `[x, y, theta]` where it truly is, shape (3,) (m, m, rad)."""
-        return self._robot.at(now).true_pose
-
-    def publish(self, now: int) -> None:
-        """Publish the odometry and the wheels of a time (ns)."""
-        self.next += self._period
-        self._stop_in_silence(now)
-        robot = self._robot.at(now)
-        covariances = robot.covariance_tuple, robot.twist_covariance_tuple(self._interval)
-        self._publish('odom', Motion(now, robot.pose_tuple, robot.twist, *covariances))
-        wheels = Wheels.of(now, self._names, robot.wheel_speeds, robot.wheel_angles)
-        self._publish('joint_states', wheels)
-        if robot.model.drift is not None:
-            self._publish('ground_truth', Motion(now, robot.true_pose_tuple, robot.true_twist))
-
-    def follow(self, wheels: Wheels, now: int) -> None:
-        """Follow a command, or raise MessageError."""
-        v, omega = self._robot.model.twist(*wheels.speeds(self._names))
-        twist = plausible_twist(v, omega)
-        self._stop_in_silence(now)
-        robot = self._robot
-        time = command_time(wheels.stamp, now, robot.stamp, robot.model.command_timeout)
-        self._robot = robot.commanded(twist, time)
-        self._publish_applied()
-
-    def _stop_in_silence(self, now: int) -> None:
-        expiry = self._robot.expiry
-        if expiry is not None and expiry <= now:
-            self._robot = self._robot.at(expiry)
-            self._publish_applied()
-
-    def _publish_applied(self) -> None:
-        self._publish('cmd_vel_out', Command(self._robot.target, self._robot.stamp))
-
-
-class Bridge:
-    """What the node wheel_bridge does."""
-
-    def __init__(self, parameters: WheelBridgeParameters, publish: Publish) -> None:
-        """Start with wheels that stand."""
-        self.silence = Deadline(parameters.cmd_vel_timeout)
-        self.next = math.inf
-        """When it publishes next, while the wheels accelerate within limits (ns)."""
-        self._period = nanoseconds(1.0 / parameters.publish_rate)
-        self._model, self._names = parameters.model(), parameters.wheel_names
-        self._acceleration = parameters.acceleration_limits()
-        self._publish = publish
-        self._twist = self._target = STANDSTILL
-        self._profile: Profile | None = None
-
-    def follow(self, command: Command, now: int) -> None:
-        """Publish the wheel speeds of a command, or start to approach them within the limits."""
-        self.silence.feed(now)
-        self._follow(command.twist, now)
-
-    def stop_in_silence(self, now: int) -> None:
-        """Stop the wheels, unless they stand: no command was received for the timeout."""
-        if self._twist != STANDSTILL or self._target != STANDSTILL:
-            self._follow(STANDSTILL, now)
-
-    def approach(self, now: int) -> None:
-        """Publish the present speeds, which approach the commanded ones."""
-        assert self._profile is not None
-        self.next += self._period
-        self._send(self._profile.twist(self._profile.seconds(now)), now)
-        if now >= self._profile.settled_at:
-            self.next = math.inf
-
-    def _follow(self, command: tuple[float, float], now: int) -> None:
-        self._target = target = self._model.limited(command)
-        if self._acceleration.unlimited:
-            self._send(target, now)
-            return
-        start = self._twist
-        if self._profile is not None:
-            start = self._profile.twist(self._profile.seconds(now))
-        self._profile = Profile(now, [*ramp(start, target, self._acceleration, self._model)])
-        self.next = now
-        self.approach(now)
-
-    def _send(self, twist: tuple[float, float], now: int) -> None:
-        self._twist = twist
-        self._publish('joint_command', Wheels.of(now, self._names, self._model.wheel_speeds(*twist)))
-
-
-class Driver:
-    """What the node go_to_goal does with one goal, and with odometry in order."""
-
-    def __init__(self, parameters: GoToGoalParameters, publish: Publish) -> None:
-        """Start without a goal."""
-        self.parameters = parameters
-        self.silence = Deadline(parameters.odom_timeout)
-        self.pursuit: Pursuit | None = None
-        """The goal and how far the robot has got. None: there is no goal."""
-        self._publish = publish
-        self._steering = Steering(parameters)
-        self.arrival = self._steering.arrival
-        self._rate = OdometryRate()
-        self._stamp = (0, 0)
-        self._driving = self._executing = self._stale = False
-
-    def accept(self, sent: Route, along_path: bool, now: int) -> None:
-        """Take a goal, or refuse it."""
-        self._stamp = sent.stamp
-        try:
-            route = read_route(sent, along_path=along_path)
-            goal = Goal.along_path(route) if along_path else Goal.through(route)
-        except ValueError as error:
-            self._refuse(error)
-            return
-        self.silence.feed(now)
-        self.pursuit = Pursuit.of(goal)
-        self._report(GoalState.ACCEPTED)
-
-    def steer(self, state: State, now: int) -> None:
-        """Answer odometry with the next command towards the goal."""
-        if self.pursuit is None:
-            return
-        self.silence.feed(now)
-        if not self._rate.measured:
-            self._rate.receive(now)
-        if not self._executing:
-            try:
-                self.pursuit = self._steering.begin(self.pursuit, state.pose)
-            except ValueError as error:
-                self.pursuit = None
-                self._refuse(error)
-                return
-            self._executing = True
-            self._report(GoalState.EXECUTING)
-        if self._stale:
-            self._stale = False
-            self._steering.reset()
-        missed = self.pursuit.missed
-        try:
-            self.pursuit, command = self._steering.command(self.pursuit, state, now, self._rate.hz)
-        except ValueError as error:
-            LOG.warning('goal aborted: %s', error)
-            self.end(GoalState.ABORTED, now)
-            return
-        if self.pursuit.missed and not missed:
-            LOG.warning('a waypoint was missed: driving to it and those after it one by one')
-        if command is None:
-            self.end(GoalState.SUCCEEDED, now)
-        else:
-            self._send(command)
-
-    def wait(self, now: int) -> None:
-        """Stop the robot because no odometry was received for the timeout, and keep the goal."""
-        self._stale = self._stale or self._executing
-        if self._driving:
-            self._stop_robot(now)
-
-    def end(self, state: GoalState, now: int) -> None:
-        """Stop the robot, and end the goal."""
-        self._stop_robot(now)
-        self.silence.stop()
-        self.pursuit = None
-        self._report(state)
-
-    def _refuse(self, error: ValueError) -> None:
-        LOG.warning('goal refused: %s', error)
-        self.silence.stop()
-        self._report(GoalState.ABORTED)
-
-    def _stop_robot(self, now: int) -> None:
-        self._steering.stopped(now)
-        self._send(STANDSTILL)
-
-    def _send(self, twist: tuple[float, float]) -> None:
-        self._driving = twist != STANDSTILL
-        self._publish('cmd_vel', Command(twist))
-
-    def _report(self, state: GoalState) -> None:
-        self._publish('goal_status', Status(int(state), self._stamp))
 
 
 class Client:
     """What the goal client does: it sends the goals with the first odometry, and follows them."""
 
-    def __init__(self, goals: NDArray[np.float64] | Path, relative: bool, publish: Publish) -> None:
+    def __init__(self, goals: NDArray[np.float64] | Path, relative: bool, world: World) -> None:
         """Start before the goals are sent."""
+        self._names = world.robot.parameters.wheel_names
         self.path = PathProgress(goals) if isinstance(goals, Path) else None
         self.goals = goals.poses if isinstance(goals, Path) else goals
-        self.robot: State | None = None
-        self.stamp = 0
-        """Stamp of the last odometry (ns)."""
+        self.robot: Motion | None = None
+        """The last odometry."""
+        self.speeds = (0.0, 0.0)
+        """Speeds of the right and the left wheel, as they were reported last (rad/s)."""
         self.state = GoalState.UNKNOWN
-        self._relative, self._publish = relative, publish
+        self._relative, self._publish = relative, world.publish
         self._sent = False
         self._begun = self._latest = 0
 
-    def follow(self, state: State, stamp: int) -> None:
-        """Take odometry with a stamp (ns)."""
-        self.robot, self.stamp = state, stamp
+    def observe(self, topic: str, value: Any) -> None:
+        """Take the value of a message."""
+        if topic == 'odom':
+            # What a receiver drops is dropped here, too.
+            with suppress(MessageError):
+                self._follow(as_read(topic, value))
+        elif topic == 'joint_states':
+            self.speeds = value.speeds(self._names)
+        elif topic == 'goal_status':
+            self.state = GoalState(value.status)
+
+    def _follow(self, motion: Motion) -> None:
+        self.robot, stamp = motion, motion.stamp
         if not self._sent:
             self._sent = True
-            self._send(state, stamp)
+            self._send(motion, stamp)
         if self.path is not None and self.state is GoalState.EXECUTING:
-            self.path.moved(np.array(state.pose))
+            self.path.moved(np.array(motion.pose))
             self._begun, self._latest = self._begun or stamp, stamp
 
-    def _send(self, state: State, now: int) -> None:
+    def _send(self, motion: Motion, now: int) -> None:
         times = None if self.path is None else self.path.path.times
         if self._relative:
-            self.goals = se2.compose(state.pose, self.goals)
+            self.goals = se2.compose(motion.pose, self.goals)
             if self.path is not None:
                 self.path = PathProgress(Path(self.goals, times))
         poses = tuple((x, y, theta) for x, y, theta in self.goals.tolist())
@@ -358,111 +127,70 @@ class Client:
         return max((self._latest - self._begun) / NANOSECONDS - self.path.path.duration, 0.0)
 
 
-def read_route(route: Route, *, along_path: bool) -> Route:
-    """Return goals as they are read from their message, a path or goals.
-
-    Raises:
-        GoalError: A receiver refuses them.
-    """
-    zeros, frames = (0.0,) * len(route.poses), ('',) * len(route.poses)
-    x, y, headings = zip(*route.poses, strict=True)
-    z, w = ((*(of(theta / 2.0) for theta in headings),) for of in (math.sin, math.cos))
-    columns = x, y, zeros, zeros, z, w
-    if not along_path:
-        return GOALS.value(*route.stamp, '', frames, *columns)
-    stamps = [(0, 0)] * len(route.poses)
-    if route.times is not None:
-        times = (route.time + nanoseconds(time) for time in route.times)
-        stamps = [divmod(time, NANOSECONDS) for time in times]
-    return PATH.value(*route.stamp, '', frames, *zip(*stamps, strict=True), *columns)
-
-
-def as_read(topic: str, value: Any) -> Any:
-    """Return the value of a message as it is read from it, whose headings are rounded as quaternions.
-
-    Raises:
-        MessageError: A receiver refuses it.
-    """
-    if isinstance(value, Route):
-        return read_route(value, along_path=topic == 'path')
-    if not isinstance(value, (Motion, Place)):
-        return value
-    x, y, theta = value.pose
-    sine, cosine = math.sin(theta / 2.0), math.cos(theta / 2.0)
-    return value._replace(pose=from_pose(x, y, 0.0, 0.0, sine, cosine))
-
-
-def read_state(motion: Motion, frame: str) -> State:
-    """Return what is read from an odometry message, whose heading is rounded as a quaternion."""
-    sec, nanosec, x, y, z, w, *_ = ODOMETRY.numbers(motion)
-    return ODOMETRY_STATE.value(frame, sec, nanosec, *motion.twist, x, y, 0.0, 0.0, z, w)
-
-
 class World:
-    """Robot, bridge, controller and client, and their time.
+    """Robot, bridge and controller, and their time."""
 
-    Attributes:
-        now: The time (ns).
-        published: Time (ns), topic and value of each message; who takes them clears the list.
-        speeds: Speeds of the right and the left wheel, as they were reported last (rad/s).
-    """
-
-    def __init__(self, request: Request, ros_arguments: Sequence[str], start: int) -> None:
-        """Start at a time (ns), with the parameters that ROS arguments give.
+    def __init__(
+        self,
+        parameters: Mapping[str, Any],
+        robot_parameters: Mapping[str, Any],
+        ros_arguments: Sequence[str],
+        start: int,
+    ) -> None:
+        """Start at a time (ns), with parameters of controller and robot, and those of ROS arguments.
 
         Raises:
             UserError: The parameters or the ROS arguments are invalid.
         """
         self.now = self._start = start
-        self.published: list[tuple[int, str, Any]] = []
-        self.speeds = (0.0, 0.0)
+        """The time (ns)."""
+        self.observers: list[Callable[[str, Any], None]] = []
+        """Each receives topic and value of every message, before the nodes do, when time `now` is."""
         self._queue: list[tuple[str, Any]] = []
         given = given_parameters(ros_arguments, NODES)
         interface = {'command_interface': 'wheels'}
-        values = {
-            '/virtual_robot': {**given['/virtual_robot'], **request.robot_parameters, **interface},
-            '/wheel_bridge': given['/wheel_bridge'],
-            '/go_to_goal': {**given['/go_to_goal'], **request.parameters},
-        }
-        of_robot = VirtualRobotParameters().at_start(values['/virtual_robot'])
-        of_bridge = WheelBridgeParameters().at_start(values['/wheel_bridge'])
-        of_driver = GoToGoalParameters().at_start(values['/go_to_goal'])
-        self._frame = of_robot.odom_frame_id
-        self.parameters = {
-            '/virtual_robot': of_robot.by_name(),
-            '/wheel_bridge': of_bridge.by_name(),
-            '/go_to_goal': of_driver.by_name(),
-        }
-        """Values of the parameters by the names of the nodes."""
-        known = {name for one in self.parameters.values() for name in one}
-        check_names(ros_arguments, known)
-        for node in (of_robot, of_bridge, of_driver):
+        try:
+            of_robot = VirtualRobotParameters().at_start(
+                {**given['/virtual_robot'], **robot_parameters, **interface}
+            )
+            of_bridge = WheelBridgeParameters().at_start(given['/wheel_bridge'])
+            of_driver = GoToGoalParameters().at_start({**given['/go_to_goal'], **parameters})
+        except ParameterError as error:
+            raise UserError(str(error)) from error
+        nodes = of_robot, of_bridge, of_driver
+        check_names(ros_arguments, {name for node in nodes for name in node.declared()})
+        for node in nodes:
             for name in OF_MESSAGES & node.declared().keys():
                 if node.by_name()[name] != node.declared()[name].default:
                     raise UserError(f'{name} chooses a type of messages, and needs rclpy')
         wheels = of_bridge.dimensions, 'virtual_robot', of_robot.dimensions
         if found := different_wheels(*wheels):
             LOG.warning('%s; %s', found, SAME_WHEELS)
-        self.robot = DrivenRobot(of_robot, self.now, self._publish)
-        self.bridge = Bridge(of_bridge, self._publish)
-        self.driver = Driver(of_driver, self._publish)
-        self.client = Client(request.goals, request.relative, self._publish)
+        self._frame = of_robot.odom_frame_id
+        self.robot = DrivenRobot(of_robot, self.now, self.publish)
+        self.bridge = Bridge(of_bridge, self.publish)
+        self.driver = Driver(of_driver, self.publish)
         self._receivers: dict[str, Callable[[Any], None]] = {
-            'odom': self._on_odometry,
-            'joint_states': self._on_joint_states,
+            'odom': lambda motion: self.driver.steer(read_state(motion, self._frame), self.now),
             'cmd_vel': self._on_command,
             'joint_command': lambda wheels: self.robot.follow(wheels, self.now),
             'goals': lambda route: self.driver.accept(route, False, self.now),
             'path': lambda route: self.driver.accept(route, True, self.now),
-            'goal_status': self._on_status,
+            'initialpose': lambda place: self.robot.place(as_read('initialpose', place), self.now),
         }
+
+    @property
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Values of the parameters by the names of the nodes."""
+        nodes = self.robot, self.bridge, self.driver
+        return dict(zip(NODES, (node.parameters.by_name() for node in nodes), strict=True))
 
     @property
     def seconds(self) -> float:
         """Time since the start (s)."""
         return (self.now - self._start) / NANOSECONDS
 
-    def advance(self, pace: Callable[[float], None]) -> None:
+    def advance(self, pace: Callable[[float], None] = lambda _: None) -> None:
         """Advance to the next event, and do what is due then.
 
         Args:
@@ -489,6 +217,8 @@ class World:
     def settle(self) -> None:
         """Receive what was published, and what is published in answer."""
         for topic, value in self._queue:
+            for observe in self.observers:
+                observe(topic, value)
             receive = self._receivers.get(topic)
             if receive is None:
                 continue
@@ -498,29 +228,32 @@ class World:
                 LOG.warning('%s dropped: %s', topic, error)
         self._queue.clear()
 
-    def stop(self) -> None:
-        """End the goal, if there is one."""
-        if self.driver.pursuit is not None:
-            self.driver.end(GoalState.CANCELED, self.now)
-
-    def _publish(self, topic: str, value: Any) -> None:
-        self.published.append((self.now, topic, value))
+    def publish(self, topic: str, value: Any) -> None:
+        """Publish a message now. It is received when the world settles."""
         self._queue.append((topic, value))
 
-    def _on_odometry(self, motion: Motion) -> None:
-        state = read_state(motion, self._frame)
-        self.client.follow(state, motion.stamp)
-        self.driver.steer(state, self.now)
+    def set_parameter(self, node: str, name: str, value: Any) -> None:
+        """Set a parameter of the controller or of the robot, of those that `live.settings` offers.
 
-    def _on_joint_states(self, wheels: Wheels) -> None:
-        self.speeds = wheels.speeds(self.robot.parameters.wheel_names)
+        Raises:
+            ParameterError: The value is invalid.
+        """
+        changed = self.driver if node == '/go_to_goal' else self.robot
+        before = changed.parameters.by_name()
+        parameters = changed.parameters.changed({name: value})
+        # A law may have gains that were no parameters before. NaN, which is none, differs from itself.
+        after = parameters.by_name().items()
+        new = {one: value for one, value in after if repr(value) != repr(before.get(one))}
+        self.publish('parameter_events', Changes(node, new, self.now))
+        self.settle()
+        if isinstance(parameters, GoToGoalParameters):
+            self.driver.change(parameters)
+        elif isinstance(parameters, VirtualRobotParameters):
+            self.robot.change(parameters, self.now)
 
     def _on_command(self, command: Command) -> None:
         v, omega = command.twist
         self.bridge.follow(Command(from_twist(v, 0.0, 0.0, 0.0, 0.0, omega)), self.now)
-
-    def _on_status(self, status: Status) -> None:
-        self.client.state = GoalState(status.status)
 
 
 def drive(request: Request, *, lockstep: bool, ros_arguments: Sequence[str] = ()) -> Outcome:
@@ -535,33 +268,29 @@ def drive(request: Request, *, lockstep: bool, ros_arguments: Sequence[str] = ()
         UserError: The parameters or the ROS arguments are invalid.
     """
     signals, progress = request.signals, request.progress
-    world = World(request, ros_arguments, START if lockstep else time.time_ns())
+    start = START if lockstep else time.time_ns()
+    world = World(request.parameters, request.robot_parameters, ros_arguments, start)
     pace = (lambda _: None) if lockstep else in_real_time()
-    kept: list[tuple[int, str, Any]] = []
-    recorder = None
+    parameters, kept = world.parameters, list[tuple[int, str, Any]]()
     if request.recording is not None:
-        recorder = ValueRecorder(request.recording, world.parameters)
+        record(world, request.recording)
 
-    def take() -> None:
-        """Take what was published, so that a recording has it soon."""
-        for now, topic, value in world.published:
-            if recorder is not None:
-                recorder.add(now, topic, value)
-            if request.keep:
-                with suppress(MessageError):
-                    kept.append((now, topic, as_read(topic, value)))
-        world.published.clear()
+    def keep(topic: str, value: Any) -> None:
+        with suppress(MessageError):
+            kept.append((world.now, topic, as_read(topic, value)))
 
-    client, driver, robot = world.client, world.driver, world.robot
+    if request.keep:
+        world.observers.append(keep)
+    client, driver, robot = Client(request.goals, request.relative, world), world.driver, world.robot
+    world.observers.append(client.observe)
     if progress is not None:
-        progress.nodes_created([*world.parameters])
+        progress.nodes_created(NODES)
 
     def turns(longest: float, handled: int = 0) -> Iterator[None]:
         """As `NodeRunner.turns`."""
         deadline = world.seconds + longest
         world.settle()
         while True:
-            take()
             yield
             if signals.count > handled or world.seconds > deadline:
                 return
@@ -574,18 +303,19 @@ def drive(request: Request, *, lockstep: bool, ros_arguments: Sequence[str] = ()
         if driver.pursuit is not None:
             index = min(driver.pursuit.index, len(client.goals) - 1)
         if progress is not None and client.robot is not None:
-            progress.driving(world.seconds, index, client.distance(index, driver), world.speeds)
+            progress.driving(world.seconds, index, client.distance(index, driver), client.speeds)
     seconds, state = world.seconds, client.state
     client.withdraw()
-    world.stop()
+    driver.cancel(world.now)
     settled = world.now + nanoseconds(SETTLING)
     for _ in turns(STOP_PATIENCE + 1.0 / robot.parameters.publish_rate, signals.count):
-        if client.robot is not None and client.stamp >= settled and client.robot.twist == STANDSTILL:
+        last = client.robot
+        if last is not None and last.stamp >= settled and last.twist == STANDSTILL:
             break
-    arrival, last = driver.arrival, client.goals[-1, :2].tolist()
+    arrival, goal = driver.arrival, client.goals[-1, :2].tolist()
     true_distance = math.nan
     if robot.parameters.drift() is not None:
-        true_distance = float(arrival.distance(*robot.true_pose(world.now).tolist(), *last))
+        true_distance = float(arrival.distance(*robot.true_pose(world.now).tolist(), *goal))
     at = client.robot
     return Outcome(
         status=int(state),
@@ -599,8 +329,14 @@ def drive(request: Request, *, lockstep: bool, ros_arguments: Sequence[str] = ()
         tolerance=arrival.xy_tolerance,
         offset=arrival.offset,
         seconds=seconds,
-        kept=run_of('drive', kept, world.parameters) if request.keep else None,
+        kept=run_of('drive', kept, parameters) if request.keep else None,
     )
+
+
+def record(world: World, recording: Recording) -> None:
+    """Record what is published from now on."""
+    recorder = ValueRecorder(recording, world.parameters)
+    world.observers.append(lambda topic, value: recorder.add(world.now, topic, value))
 
 
 def in_real_time() -> Callable[[float], None]:
