@@ -94,13 +94,19 @@ def _changes_by_command(run: Run) -> dict[int, list[dict[str, Any] | FaultEvent]
     def is_free(index: int) -> bool:
         return index not in changes
 
+    def repeats(index: int) -> bool:
+        twists = run.cmd_vel_out.values[max(index - 1, 0) : index + 1]
+        return bool((twists == twists[0]).all())
+
     for recorded, change in run.parameter_events:
         if base_name(change.node) == ROBOT:
             first, last = np.searchsorted(received, [recorded - MARGIN, recorded + MARGIN + 1])
             later = [one for one in range(first, last) if stamps[one] >= change.stamp]
-            # Of those at the earliest time, that of no other change, or the last one.
+            # Of those at the earliest time, one that repeats the command before, or the last one: a
+            # controller may have sent another command at that time. Each for one change.
             together = [one for one in later if stamps[one] == min(stamps[later])] or [int(last)]
-            changes[next(filter(is_free, together), together[-1])].append(change.values)
+            likely = [one for one in together if repeats(one)] or together[::-1]
+            changes[next(filter(is_free, likely), together[-1])].append(change.values)
     for recorded, event in run.fault_events:
         if event.kind in _MOTOR_FAULTS and base_name(event.arguments.get('robot') or ROBOT) == ROBOT:
             index = int(np.searchsorted(received, recorded))

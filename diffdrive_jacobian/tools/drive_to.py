@@ -122,11 +122,8 @@ def _check(parser: _cli.Parser, options: argparse.Namespace) -> None:
 
 def _check_without_ros(options: argparse.Namespace) -> None:
     """Say that no nodes run, and refuse what needs them."""
-    for option in ('live', 'open'):
-        if getattr(options, option):
-            raise UserError(
-                f'--{option} needs ROS 2, there is no Python module rclpy: {how_to_get_ros()}'
-            )
+    if options.open:
+        raise UserError(f'--open needs ROS 2, there is no Python module rclpy: {how_to_get_ros()}')
     _output.note(PROGRAM, 'ROS 2 is not available: driving without nodes, as they drive in lockstep')
 
 
@@ -134,8 +131,12 @@ def _drive_with_page(goals: Goals, options: argparse.Namespace, how: dict[str, A
     """Drive with the page until Ctrl-C; return the exit code. `how`: arguments of `drive`."""
     given = len(options.coordinates) > 0 or options.path is not None
     with watch_run.explaining_page_errors(options.port):
-        from diffdrive_jacobian.live.node import drive_live
+        from diffdrive_jacobian.drives.driving import has_ros
 
+        if has_ros():
+            from diffdrive_jacobian.live.node import drive_live
+        else:
+            from diffdrive_jacobian.live.value_page import drive_live
         drive_live(
             goals,
             port=options.port,

@@ -1,4 +1,4 @@
-"""The node behind the live page, in lockstep with robot, wheel bridge and controller."""
+"""What is behind the live page: its node, in lockstep with the others, or a robot without nodes."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from support.lockstep_nodes import QUICK, make_complete
 
+from diffdrive_jacobian.bags import read_run, verify
 from diffdrive_jacobian.control.controller import KP
-from diffdrive_jacobian.live import hand
+from diffdrive_jacobian.drives.values import START, World, record
+from diffdrive_jacobian.live import hand, value_page
 from diffdrive_jacobian.live import node as live_node
 from diffdrive_jacobian.live.commands import (
     CancelGoal,
@@ -28,11 +30,14 @@ from diffdrive_jacobian.live.commands import (
     SetParameter,
 )
 from diffdrive_jacobian.live.node import LivePage
+from diffdrive_jacobian.live.pacing import Pacing
 from diffdrive_jacobian.live.session import Session
+from diffdrive_jacobian.live.value_page import ValuePage
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.recording.recording import open_recording
 
 pytestmark = pytest.mark.slow
 
@@ -50,9 +55,13 @@ class Live:
         for command in commands:
             assert self.session.put(page or self.page, command)
 
+    @property
+    def elapsed(self):
+        return self.world.elapsed
+
     def pass_time(self, seconds=0.02):
-        end = self.world.elapsed + seconds
-        while self.world.elapsed < end:
+        end = self.elapsed + seconds
+        while self.elapsed < end:
             self.node.work()
             self.world.step(0.02)
         self.node.work()
@@ -60,10 +69,26 @@ class Live:
         self.node.work()
 
     def until(self, condition, timeout=20.0):
-        end = self.world.elapsed + timeout
+        end = self.elapsed + timeout
         while not condition():
-            assert self.world.elapsed < end, (self.texts, self.robot())
+            assert self.elapsed < end, (self.texts, self.robot())
             self.pass_time()
+
+    def commands(self):
+        """Return `(v, omega)` of the commands from now on."""
+        found = []
+
+        def keep(one):
+            found.append((one.linear.x, one.angular.z))
+
+        self.world.node.create_subscription(Twist, 'cmd_vel', keep, 10)
+        return found
+
+    def ends(self):
+        """Return the ends of goals from now on."""
+        found = []
+        self.node.robots['/'].on_end = found.append
+        return found
 
     @property
     def snapshot(self):
@@ -84,13 +109,47 @@ class Live:
         return self.robot(name)['goal']['state']
 
 
+class LiveValues(Live):
+    """An open page, and a robot without nodes behind it."""
+
+    def __init__(self, **parameters):
+        self.world = World({**QUICK, **parameters}, {}, (), START)
+        self.session = Session()
+        self.page = self.session.enter()
+        self.node = ValuePage(self.session, self.world, Pacing(), controlled=False)
+
+    @property
+    def elapsed(self):
+        return self.world.seconds
+
+    def pass_time(self, seconds=0.02):
+        end = self.elapsed + seconds
+        while self.elapsed < end:
+            self.node.work()
+            self.world.advance()
+        self.node.work()
+
+    def commands(self):
+        found = []
+        self.world.observers.append(
+            lambda topic, value: found.append(value.twist) if topic == 'cmd_vel' else None
+        )
+        return found
+
+    def ends(self):
+        found = []
+        self.node.robot.on_end = found.append
+        return found
+
+
 def at_rest(robot):
     return (robot['now']['v'], robot['now']['omega']) == (0.0, 0.0)
 
 
 @pytest.fixture
 def live(lockstep, monkeypatch):
-    monkeypatch.setattr(live_node, 'PERIOD', 0.0)
+    for module in (live_node, value_page):
+        monkeypatch.setattr(module, 'PERIOD', 0.0)
     monkeypatch.setattr(live_node, 'DISCOVERY_PERIOD', 0.0)
     # By the clock on the wall, which has nothing to do with simulated time.
     monkeypatch.setattr(hand, 'DEAD_MAN', math.inf)
@@ -98,12 +157,24 @@ def live(lockstep, monkeypatch):
 
 
 @pytest.fixture
-def driven(live):
+def by_nodes(live):
     """A robot with controller and wheel bridge, known to the page."""
     for node in (VirtualRobot, WheelBridge, GoToGoal):
         parameters = {'command_interface': 'wheels'} if node is VirtualRobot else {}
         live.world.add(make_complete(node, **parameters, **(QUICK if node is GoToGoal else {})))
     live.until(lambda: live.robot() and len(live.settings()) > 8)
+    return live
+
+
+@pytest.fixture(params=['nodes', 'values'])
+def driven(request, monkeypatch):
+    """Likewise, by nodes or without."""
+    if request.param == 'nodes':
+        return request.getfixturevalue('by_nodes')
+    monkeypatch.setattr(value_page, 'PERIOD', 0.0)
+    monkeypatch.setattr(hand, 'DEAD_MAN', math.inf)
+    live = LiveValues()
+    live.until(live.robot)
     return live
 
 
@@ -136,8 +207,7 @@ def test_a_goal_is_driven_to_and_every_number_of_the_chain_is_there(driven):
 
 
 def test_waypoints_are_appended_and_the_ends_of_goals_are_reported(driven):
-    ends = []
-    driven.node.robots['/'].on_end = ends.append
+    ends = driven.ends()
     # To a goal that was sent just now.
     driven.send(goal(0.2, 0.0), goal(0.2, 0.2, append=True))
     driven.until(lambda: driven.state() == 'executing')
@@ -167,22 +237,21 @@ def test_waypoints_are_appended_and_the_ends_of_goals_are_reported(driven):
 
 
 def test_driving_by_hand_cancels_the_goal_first_and_stops_with_the_page(driven):
-    commands = driven.world.listen(Twist, 'cmd_vel')
+    commands = driven.commands()
     driven.send(goal(5.0, 0.0))
     driven.until(lambda: driven.state() == 'executing')
     driven.send(DriveByHand('/', 0.25, 0.5))
     driven.until(lambda: driven.robot()['by_hand'] and driven.robot()['commanded'], timeout=2.0)
-    driven.until(lambda: commands[-1].linear.x == 0.25, timeout=2.0)
+    driven.until(lambda: commands[-1][0] == 0.25, timeout=2.0)
     assert driven.state() == 'canceled'
     assert 'driving by hand: the goal is canceled' in driven.texts
     # No command of the controller comes between.
-    by_hand = [(one.linear.x, one.angular.z) for one in commands]
-    first = by_hand.index((0.25, 0.5))
-    assert by_hand[first - 1] == (0.0, 0.0)
-    assert set(by_hand[first:]) == {(0.25, 0.5)}
+    first = commands.index((0.25, 0.5))
+    assert commands[first - 1] == (0.0, 0.0)
+    assert set(commands[first:]) == {(0.25, 0.5)}
     driven.session.leave(driven.page)
     driven.pass_time(0.1)
-    assert commands[-1] == Twist()
+    assert commands[-1] == (0.0, 0.0)
     stopped = len(commands)
     driven.pass_time(0.5)
     assert len(commands) == stopped
@@ -234,10 +303,12 @@ def test_parameters_are_set_and_refusals_are_shown(driven):
     # The nodes serve ranges of all valid values, which are too many for a slider.
     row = driven.settings()['controller/kp']
     assert (row['low'], row['high']) == KP.usual
-    # What others change is followed.
-    controller = next(node for node in driven.world.nodes if isinstance(node, GoToGoal))
+
+
+def test_parameters_that_others_change_are_followed(by_nodes):
+    controller = next(node for node in by_nodes.world.nodes if isinstance(node, GoToGoal))
     controller.set_parameters([Parameter('kv', value=1.25)])
-    driven.until(lambda: driven.settings()['controller/kv']['value'] == 1.25, timeout=2.0)
+    by_nodes.until(lambda: by_nodes.settings()['controller/kv']['value'] == 1.25, timeout=2.0)
 
 
 class Driver(Node):
@@ -329,24 +400,24 @@ def test_a_slow_robot_takes_stamped_commands_and_the_end_says_how_far_it_rolls(l
     live.until(lambda: any('rolls on for about 0.100 m' in text for text in live.texts), timeout=2.0)
 
 
-def test_a_node_that_changes_its_name_leaves_nothing_behind(driven):
-    robot, refused = driven.node.robots['/'], []
-    before = len(list(driven.node.clients))
+def test_a_node_that_changes_its_name_leaves_nothing_behind(by_nodes):
+    robot, refused = by_nodes.node.robots['/'], []
+    before = len(list(by_nodes.node.clients))
     for number in range(5):
         robot.use_nodes({role: (f'/{role}_{number}', b'') for role in ('robot', 'controller')})
     robot.links['robot'].set('x', 1.0, refused.append)
-    assert len(list(driven.node.clients)) <= before + 2 * 3
+    assert len(list(by_nodes.node.clients)) <= before + 2 * 3
     robot.use_nodes({'robot': ('/virtual_robot', b'')})
     assert refused == ['/robot_4 is gone']
     assert not robot.state.controlled
     robot.destroy()
-    assert not list(driven.node.clients)
+    assert not list(by_nodes.node.clients)
 
 
 @pytest.mark.parametrize('role', ['robot', 'controller'])
-def test_a_node_that_was_started_again_is_asked_again_and_drives_to_nothing(driven, role):
+def test_a_node_that_was_started_again_is_asked_again_and_drives_to_nothing(by_nodes, role):
     """It has the same name, and perhaps other parameters. It is known by its publisher."""
-    robot = driven.node.robots['/']
+    robot = by_nodes.node.robots['/']
     robot.use_nodes({role: ('/name', b'')})
     robot.state.goal.reported(GoalState.EXECUTING, (1, 0))
     link = robot.links[role]
@@ -399,3 +470,34 @@ def test_the_robot_is_placed_and_the_heading_of_a_goal_is_shown_where_it_counts(
     driven.send(goal(0.3, 0.2, 2.0))
     driven.pass_time(0.1)
     assert driven.texts == [text]
+
+
+@pytest.mark.parametrize('change', ['wheel_lag', 'linear.x.max_acceleration'])
+def test_a_robot_that_changes_while_it_drives_is_recorded_without_nodes(tmp_path, monkeypatch, change):
+    """It has a place, too, and its odometry is reset: all of that is in the bag."""
+    monkeypatch.setattr(hand, 'DEAD_MAN', math.inf)
+    live = LiveValues(**{'linear.x.max_velocity': 0.5})
+    recording = open_recording('drive', str(tmp_path / 'run'), lossless=True)
+    record(live.world, recording)
+    live.send(goal(0.5, 9.0))
+    live.pass_time(0.5)
+    # At the time of a command.
+    live.send(SetParameter('/', f'robot/{change}', 0.25))
+    live.pass_time(0.5)
+    live.send(DriveByHand('/', 0.3, -0.5))
+    live.pass_time(0.5)
+    live.send(Release('/'))
+    live.pass_time(0.1)
+    live.send(Place('/', 1.0, -2.0, 0.5), goal(9.0, -2.0))
+    live.pass_time(1.0)
+    live.send(Reset('/'))
+    live.pass_time(0.5)
+    live.node.stop()
+    recording.finish()
+    run = read_run(tmp_path / 'run')
+    assert [change.values for _, change in run.parameter_events] == [{change: 0.25}]
+    assert len(run.start_pose) == 3
+    assert [GoalState(int(one)).name for one in run.goal_status.values[:, 0]] == [
+        *('ACCEPTED', 'EXECUTING', 'CANCELED') * 2
+    ]
+    assert verify(run).agrees(1e-9, 1e-9)
