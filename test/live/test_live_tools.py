@@ -16,10 +16,14 @@ from chromium import until
 from support import commands
 from websockets.sync.client import connect
 
+from diffdrive_jacobian.drives import driving
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import watch_run
 
 QUICK = ('--ros-args', '-p', 'go_to_goal:kp:=8.0', '-p', 'go_to_goal:kv:=4.0')
+
+
+WITHOUT_ROS = 'drive_to: ROS 2 is not available: driving without nodes, as they drive in lockstep\n'
 
 
 def opened(url):
@@ -63,7 +67,7 @@ def run_with_page(monkeypatch):
         monkeypatch.setenv('DISPLAY', ':0')
         ended = commands.run(*command, signals=signals)
         assert len(visits) == 1, ended
-        assert (ended.code, ended.err) == (0, '')
+        assert (ended.code, ended.err) == (0, '' if driving.has_ros() else WITHOUT_ROS)
         return ended.out
 
     return run_with
@@ -94,14 +98,19 @@ def test_watch_run_beside_nodes_and_the_robot_stops_with_the_page(world):
     assert watch.stderr == ''
 
 
-def test_drive_to_live_waits_for_the_page_and_records_and_watch_run_plays_it(run_with_page, tmp_path):
+@pytest.mark.parametrize('ros', [True, False])
+def test_drive_to_live_waits_for_the_page_and_records_and_watch_run_plays_it(
+    run_with_page, tmp_path, monkeypatch, ros
+):
     bag = tmp_path / 'bag'
 
     def drive(page):
         page.send(json.dumps({'do': 'speed', 'speed': 50}))
         until(lambda: has_arrived(page), 'arrives')
 
-    out = run_with_page(drive, 'drive_to', 0.2, 0.1, '--live', '--lockstep', '-o', bag, *QUICK)
+    with monkeypatch.context() as patched:
+        patched.setattr(driving, 'has_ros', lambda: ros)
+        out = run_with_page(drive, 'drive_to', 0.2, 0.1, '--live', '--lockstep', '-o', bag, *QUICK)
     assert 'it goes on after the goals, until Ctrl-C' in out
     goal, recorded = out.splitlines()[-2:]
     assert re.fullmatch(
