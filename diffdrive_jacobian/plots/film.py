@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from diffdrive_jacobian.bags.timeline import Array, Timeline, timeline
+from diffdrive_jacobian.bags.timeline import Array, Timeline, seconds, timeline
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.numerics.checks import number, positive
 from diffdrive_jacobian.plots import run_panels, sketch
 from diffdrive_jacobian.plots.output_files import FILM_FORMATS, check_directory, extension
 from diffdrive_jacobian.plots.rendering import styled
 from diffdrive_jacobian.plots.run_pictures import COLORS, as_runs, run_figure
-from diffdrive_jacobian.plots.run_plane import VISIBLE, size
+from diffdrive_jacobian.plots.run_plane import OF_DRIVE, TRUTH, VISIBLE, size
 
 RATE = 20
 """Frames per second of a film: GIF has periods of whole hundredths of a second."""
@@ -29,6 +29,8 @@ DPI = 90
 INLINE_DPI = 65
 INLINE_FRAMES = 100
 """Largest number of frames of a film in a notebook, each of which is a picture in it."""
+LATER = 0.2
+"""Opacity of what the robots have not done yet."""
 BUTTONS = {
     **{'minus': '-', 'fast-backward': '|<', 'step-backward': '<', 'play fa-flip-horizontal': 'back'},
     **{'pause': '||', 'play': 'play', 'step-forward': '>', 'fast-forward': '>|', 'plus': '+'},
@@ -60,10 +62,10 @@ class Film:
             number('speed', speed, positive)
         runs = as_runs(runs)
         self._timelines = [timeline(run) for run in runs]
-        zeros = map(run_panels.zero, self._timelines)
+        self._zeros = [run_panels.zero(one) for one in self._timelines]
         self._times = [
             np.maximum.accumulate(one.time) - zero
-            for one, zero in zip(self._timelines, zeros, strict=True)
+            for one, zero in zip(self._timelines, self._zeros, strict=True)
         ]
         first = min(run_panels.beginning(one) for one in self._timelines)
         last = max(float(times[-1]) for times in self._times)
@@ -132,10 +134,10 @@ class Film:
         plane, *panels = self._figure.axes
         left, right = plane.get_xlim()
         inches = plane.get_window_extent().width / self._figure.dpi / (right - left)
-        moves = [
-            _robot(plane, one, times, color, inches)
-            for one, times, color in zip(self._timelines, self._times, cycle(COLORS), strict=False)
-        ]
+        for later in plane.findobj(lambda artist: artist.get_gid() == OF_DRIVE):
+            later.set_alpha(LATER)
+        runs = zip(self._timelines, self._times, self._zeros, cycle(COLORS), strict=False)
+        moves = [_robot(plane, *run, inches) for run in runs]
         cursors = [panel.axvline(self._shown[0], color='black', lw=1.0, zorder=6) for panel in panels]
         style: Any = {'transform': plane.transAxes, 'ha': 'right', 'va': 'bottom', 'fontsize': 11}
         clock = plane.text(1.0, 1.01, '', **style)
@@ -154,7 +156,7 @@ class Film:
 
 
 def _robot(
-    plane: Any, one: Timeline, times: Array, color: str, inches: float
+    plane: Any, one: Timeline, times: Array, zero: float, color: str, inches: float
 ) -> Callable[[float], None]:
     """Draw a robot with the path that it has driven; return a function that moves it to a time.
 
@@ -162,25 +164,35 @@ def _robot(
         plane: The axes.
         one: The run.
         times: The times of its odometry on the axis of time, shape (n,) (s).
+        zero: What that axis begins with (s).
         color: Its color.
         inches: Size of a meter in the plane.
     """
-    poses, found = one.run.odometry.values[:, :3], size(one.run)
-    driven = plane.plot([], [], color=color, lw=3.5, alpha=0.6, zorder=3.5)[0]
+    run, found = one.run, size(one.run)
+    poses, truths = run.odometry.values[:, :3], run.ground_truth.values[:, :2]
+    driven = plane.plot([], [], color=color, lw=2.6, zorder=3.5)[0]
+    truth_times = np.maximum.accumulate(seconds(run, run.ground_truth)) - zero
+    truly = plane.plot([], [], color=color, zorder=3.4, **TRUTH)[0]
+    true = plane.plot([], [], 'D', ms=6, mfc='white', mec=color, mew=1.5, zorder=8.5)[0]
+    parts: list[tuple[Array, Any]] = []
+    mark = None
     if found is None or found.separation * inches < VISIBLE:
-        body = plane.plot([], [], 'o', ms=9, color=color, mec='white', zorder=8, clip_on=False)[0]
-        outline = np.zeros((1, 2))
+        mark = plane.plot([], [], 'o', ms=9, color=color, mec='white', zorder=8, clip_on=False)[0]
     else:
-        body = plane.fill([], [], fc=color, ec='black', alpha=0.8, zorder=8, clip_on=False)[0]
-        outline = found.separation * sketch.BODY
+        style: Any = {'ec': 'black', 'clip_on': False}
+        outlines = [found.separation * sketch.BODY, *sketch.wheel_outlines(*found)]
+        for outline, fc, zorder in zip(outlines, (color, *'kk'), (8.0, 8.1, 8.1), strict=True):
+            parts.append((outline, plane.fill([], [], fc=fc, zorder=zorder, alpha=0.8, **style)[0]))
 
     def move(time: float) -> None:
-        last = max(int(np.searchsorted(times, time, side='right')) - 1, 0)
-        driven.set_data(*poses[: last + 1, :2].T)
-        corners = sketch.placed(outline, poses[last])
-        if len(outline) == 1:
-            body.set_data(*corners.T)
-        else:
-            body.set_xy(corners)
+        count = max(int(np.searchsorted(times, time, side='right')), 1)
+        driven.set_data(*poses[:count, :2].T)
+        if mark is not None:
+            mark.set_data(*poses[count - 1 : count, :2].T)
+        for outline, part in parts:
+            part.set_xy(sketch.placed(outline, poses[count - 1]))
+        known = int(np.searchsorted(truth_times, time, side='right'))
+        truly.set_data(*truths[:known].T)
+        true.set_data(*truths[max(known - 1, 0) : known].T)
 
     return move

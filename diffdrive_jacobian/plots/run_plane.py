@@ -29,6 +29,8 @@ LEAST = 0.5
 """Least width and height of the plane (m): the noise of a robot at rest must not fill it."""
 MARGIN = 0.06
 """Margin of the plane, as a part of its larger side."""
+OF_DRIVE = 'drive'
+"""Mark (gid) of what shows the whole drive, which a film shows little by little."""
 VISIBLE = 0.12
 """Wheel separation from which on the robot is drawn to scale (inches)."""
 _ARROW: Any = {
@@ -102,33 +104,38 @@ class Plane:
         Of several runs the robots have outlines only, so that all can be seen.
         """
         axes, poses, travelled = self.axes, one.run.odometry.values[:, :3], one.travelled()
-        axes.plot(*line(poses[:, :2], one.breaks).T, color=color, ls=style, lw=1.8)
+        axes.plot(*line(poses[:, :2], one.breaks).T, color=color, ls=style, lw=1.8, gid=OF_DRIVE)
         evenly = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], ARROWS + 1)[1:-1])
         evenly = evenly if self.to_scale else np.append(evenly, len(travelled) - 1)
         x, y, theta = poses[np.unique(evenly)].T
-        axes.quiver(x, y, np.cos(theta), np.sin(theta), color=color, zorder=3, scale=5.0, **_ARROW)
+        headings: Any = {**_ARROW, 'color': color, 'zorder': 3, 'scale': 5.0, 'gid': OF_DRIVE}
+        axes.quiver(x, y, np.cos(theta), np.sin(theta), **headings)
         starts, robot = poses[[0, *one.breaks[:MARKED]]], size(one.run)
         if self.to_scale and robot is not None:
             for pose in starts:
                 self._robot(pose, robot, ec=color, fc='white', alpha=0.6, zorder=1.0, ls='--')
             filled: Any = {'fc': color, 'alpha': 0.4} if alone else {'fc': 'none', 'lw': 1.8}
-            self._robot(poses[-1], robot, ec=color, zorder=1.05, **filled)
+            self._robot(poses[-1], robot, ec=color, zorder=1.05, **filled, gid=OF_DRIVE)
             return
         axes.plot(*starts[:, :2].T, 'o', ms=9, mfc='white', mec=color, mew=1.8, zorder=2.5)
-        axes.plot(*poses[-1, :2], 's', ms=7, mfc=color, mec='white', mew=0.8, zorder=5)
+        axes.plot(*poses[-1, :2], 's', ms=7, mfc=color, mec='white', mew=0.8, zorder=5, gid=OF_DRIVE)
 
     def _robot(self, pose: Array, robot: Size, *, zorder: float, **style: Any) -> None:
         sketch.outline(
             self.axes, sketch.placed(robot.separation * sketch.BODY, pose), zorder=zorder, **style
         )
-        sketch.wheels(self.axes, pose, *robot, zorder=zorder + 0.02, alpha=0.8)
+        gid = style.get('gid')
+        sketch.wheels(self.axes, pose, *robot, zorder=zorder + 0.02, alpha=0.8, gid=gid)
 
     def ground_truth(self, run: Run, color: str) -> None:
         """Draw the true path with its end, if it was recorded."""
         if len(run.ground_truth):
             places = run.ground_truth.values[:, :2]
-            self.axes.plot(*line(places, jumps(run.ground_truth)).T, color=color, zorder=2.2, **TRUTH)
-            self.axes.plot(*places[-1], 'D', ms=6, mfc='white', mec=color, mew=1.5, zorder=5)
+            self.axes.plot(
+                *line(places, jumps(run.ground_truth)).T, color=color, zorder=2.2, gid=OF_DRIVE, **TRUTH
+            )
+            end: Any = {'ms': 6, 'mfc': 'white', 'mec': color, 'mew': 1.5, 'zorder': 5, 'gid': OF_DRIVE}
+            self.axes.plot(*places[-1], 'D', **end)
 
     def planned_paths(self, one: Timeline) -> None:
         """Draw the paths that were sent, below the path that was driven."""

@@ -145,7 +145,14 @@ def wheels(axes: Axes, pose: ArrayLike, r: float, L: float, zorder: float = 3.0,
     """Draw the wheels of a robot from above with their axle."""
     axle = placed([[0.0, -L / 2.0], [0.0, L / 2.0]], pose)
     line(axes, *axle, lw=2.0, color=GREY, zorder=zorder - 1.0, **style)
-    half = TYRE * L / 2.0
-    for side in (-L / 2.0, L / 2.0):
-        wheel = [[-r, side - half], [r, side - half], [r, side + half], [-r, side + half]]
+    for wheel in wheel_outlines(r, L):
         outline(axes, placed(wheel, pose), fc='#bbbbbb', zorder=zorder, **style)
+
+
+def wheel_outlines(r: float, L: float) -> list[NDArray[np.float64]]:
+    """Return the outlines of the right and the left wheel in the body frame, shape (4, 2) each (m)."""
+    half = TYRE * L / 2.0
+    return [
+        np.array([[-r, side - half], [r, side - half], [r, side + half], [-r, side + half]])
+        for side in (-L / 2.0, L / 2.0)
+    ]
