@@ -117,12 +117,19 @@ def as_runs(given: Any) -> list[Run]:
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """Return names for bags: as many last parts of their paths as make them different."""
+    """Return names for bags: as many last parts of their paths as make them different.
+
+    Those of the same path have numbers, as the outcomes of drives that were not recorded.
+    """
     parts = [path.resolve().parts for path in paths]
     count = 1
     while count < max(map(len, parts)) and len({one[-count:] for one in parts}) < len(set(parts)):
         count += 1
-    return [os.fsencode('/'.join(one[-count:])).decode(errors='replace') for one in parts]
+    names = [os.fsencode('/'.join(one[-count:])).decode(errors='replace') for one in parts]
+    return [
+        name if names.count(name) == 1 else f'{name} {names[: index + 1].count(name)}'
+        for index, name in enumerate(names)
+    ]
 
 
 def _header(labels: Sequence[str], found: Sequence[RunSummary]) -> tuple[list[str], list[str]]:

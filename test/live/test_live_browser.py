@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -11,6 +12,7 @@ import time
 
 import pytest
 from chromium import Browser, find_chromium, until
+from PIL import Image
 from support import processes
 from support.processes import open_world
 
@@ -303,6 +305,29 @@ def test_nothing_is_clipped_or_covered_on_usual_screens(live):
     assert browser.evaluate('document.getElementById("map").clientWidth') > 300
     browser.evaluate('document.getElementById("goto-x").value = "1"')
     browser.size(1280, 800)
+
+
+def test_a_still_and_a_film_of_the_map_are_saved(live, tmp_path):
+    browser = live.browser
+    browser.call('Browser.setDownloadBehavior', behavior='allow', downloadPath=str(tmp_path))
+
+    def saved(*endings):
+        found = [one for one in tmp_path.iterdir() if one.suffix in endings]
+        return found[0].read_bytes() if found else None
+
+    browser.evaluate('document.getElementById("film").click()')
+    live.drive('KeyW')
+    browser.evaluate('document.getElementById("picture").click()')
+    picture = Image.open(io.BytesIO(until(lambda: saved('.png'), 'the still is saved')))
+    assert picture.width == browser.evaluate('document.getElementById("map").width')
+    # On the ground of the map, with something on it.
+    assert picture.convert('RGBA').getextrema()[3] == (255, 255)
+    assert len(picture.convert('RGB').getcolors(100_000)) > 10
+    browser.key('Up', 'KeyW')
+    live.settled()
+    browser.evaluate('document.getElementById("film").click()')
+    assert len(until(lambda: saved('.mp4', '.webm'), 'the film is saved')) > 2_000
+    assert browser.errors == []
 
 
 def test_the_page_says_when_the_connection_is_lost(live):

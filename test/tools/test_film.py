@@ -48,7 +48,7 @@ def test_robots_are_where_they_were_and_leave_a_trace(recorded):
             assert len(found) == len(runs)
             if len(runs) == 1:
                 np.testing.assert_allclose(found[0][:-1], sketch.placed(0.16 * sketch.BODY, pose))
-            trace = next(line for line in film._figure.axes[0].lines if line.get_lw() == 3.5)
+            trace = next(line for line in film._figure.axes[0].lines if line.get_zorder() == 3.5)
             np.testing.assert_allclose(trace.get_xydata()[-1], pose[:2])
         cursors = [panel.lines[-1].get_xdata() for panel in film._figure.axes[1:]]
         assert {tuple(one) for one in cursors} == {(one.time[-1] - zero(one) + 1e-6,) * 2}

@@ -157,6 +157,7 @@ def test_several_runs_get_one_picture_and_a_table_each(folder):
         assert (folder / 'x' / 'bag_and_bag.png').exists()
     assert names_of([Path('/a/run'), Path('/b/walk')]) == ['run', 'walk']
     assert names_of([Path('/a/x/run'), Path('/b/x/run')]) == ['a/x/run', 'b/x/run']
+    assert names_of([Path('/a/drive'), Path('/b'), Path('/a/drive')]) == ['drive 1', 'b', 'drive 2']
 
 
 @pytest.mark.usefixtures('undrawn')

@@ -1,5 +1,6 @@
 // The page: puts its parts together and draws.
 
+import { Capture } from './capture.js';
 import { Chain } from './chain.js';
 import { Connection } from './connection.js';
 import { byId, element, parseHeading, parseNumber, setText } from './dom.js';
@@ -35,6 +36,7 @@ const pointer = new MapPointer(byId('map'), view, drawing, model, send, showFoll
 const hand = new HandDriving(model, send), chain = new Chain(byId('chain'));
 const settings = new Settings(model, send), transport = new Transport(model, send);
 const strips = new Strips(byId('strips'), model, (time) => transport.seek(time));
+const capture = new Capture(byId('map'), model, notices);
 followTheme(byId('theme'), () => { drawing.colors = themeColors(); changed = true; });
 
 const connection = new Connection((frame) => {
@@ -141,7 +143,10 @@ function draw(now) {
   }
   if (model.recorded && !fitted && model.paths.size) { fitted = true; drawing.draw(0); byId('fit').click(); }
   // Without news there is nothing to draw.
-  if (fresh || pointer.action || moving) drawing.draw((now - before) / 1000);
+  if (fresh || pointer.action || moving) {
+    drawing.draw((now - before) / 1000);
+    capture.drawn();
+  }
   before = now;
   moving = Math.hypot(view.x - x, view.y - y) * view.scale > 0.2 || view.scale !== scale;
 }
