@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib.util import find_spec
@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.control import Path
+from diffdrive_jacobian.control import Controller, Path, PathController
+from diffdrive_jacobian.control.controller import ControlLaw
 from diffdrive_jacobian.control.controllers import names_of_gains
 from diffdrive_jacobian.control.path_source import is_shape, planned_path
 from diffdrive_jacobian.drives.outcome import DriveProgress, Outcome, Request, waypoints_through
@@ -39,8 +40,8 @@ def drive(
     goals: ArrayLike | Path | str | FilePath,
     *,
     relative: bool | None = None,
-    controller: str | None = None,
-    path_controller: str | None = None,
+    controller: str | Controller | None = None,
+    path_controller: str | PathController | None = None,
     runner: NodeRunner | None = None,
     lockstep: bool = False,
     isolated: bool = True,
@@ -65,7 +66,8 @@ def drive(
             'circle:1.0' or the name of a file.
         relative: Whether the goals are in the body frame of the robot where it starts. Otherwise they
             are in the frame of the odometry. None: shapes such as 'circle:1.0' are.
-        controller: The parameter `controller` of go_to_goal. None: as `parameters` say.
+        controller: The parameter `controller` of go_to_goal, or a law of your own. None: as `parameters`
+            say.
         path_controller: Likewise.
         runner: Runs the nodes, and may run others: `in_real_time` or `in_lockstep`. The nodes stay in
             it. None: one is created as `lockstep`, `isolated` and `ros_arguments` say, and closed at
@@ -107,24 +109,26 @@ def drive(
             f"ros_arguments must be a list that begins with '--ros-args', got {ros_arguments!r}"
         )
     laws = {'controller': controller, 'path_controller': path_controller}
-    chosen = {name: law for name, law in laws.items() if law is not None}
-    of_controller = {**checked_parameters('parameters', parameters), **chosen}
+    own = {name: law for name, law in laws.items() if isinstance(law, ControlLaw)}
+    chosen = {name: getattr(law, 'name', law) for name, law in laws.items() if law is not None}
+    of_controller = {**checked_parameters('parameters', parameters, own.values()), **chosen}
     of_robot = checked_parameters('robot_parameters', robot_parameters)
     to = as_goals(goals)
     if path_controller is not None and not (isinstance(to, Path) or of_controller.get('pass_waypoints')):
         raise ValueError('path_controller has no effect on goals without pass_waypoints')
     with ExitStack() as stack:
-        own = None
+        bag = None
         if isinstance(recording, (str, FilePath)):
             # Slow to import.
             from diffdrive_jacobian.recording.recording import open_recording, saved_on_error
 
-            recording = own = open_recording('drive', str(recording), lossless=lockstep)
-            stack.enter_context(saved_on_error(own))
+            recording = bag = open_recording('drive', str(recording), lossless=lockstep)
+            stack.enter_context(saved_on_error(bag))
         request = Request(
             goals=to,
             relative=relative,
             timeout=timeout,
+            laws=own,
             parameters=of_controller,
             robot_parameters=of_robot,
             recording=recording,
@@ -149,13 +153,13 @@ def drive(
             if not isolated:
                 raise UserError('other processes need rclpy, which is not installed')
             outcome = values.drive(request, lockstep=lockstep, ros_arguments=ros_arguments)
-        if own is not None:
-            own.finish()
-    if own is None or not keep:
+        if bag is not None:
+            bag.finish()
+    if bag is None or not keep:
         return outcome
     from diffdrive_jacobian.bags.run import read_run
 
-    return replace(outcome, kept=read_run(own.bag))
+    return replace(outcome, kept=read_run(bag.bag))
 
 
 def has_ros() -> bool:
@@ -166,18 +170,21 @@ def has_ros() -> bool:
         return False
 
 
-def checked_parameters(argument: str, given: Mapping[str, Any] | None) -> dict[str, Any]:
+def checked_parameters(
+    argument: str, given: Mapping[str, Any] | None, laws: Iterable[ControlLaw] = ()
+) -> dict[str, Any]:
     """Return the parameters of one node for a drive, with numbers of Python.
 
     Args:
         argument: 'parameters' or 'robot_parameters'.
         given: Values by name; None: none.
+        laws: Laws whose gains are parameters of go_to_goal, too.
 
     Raises:
         ValueError: It is no mapping from names.
         UserError: The node has no parameter of a name.
     """
-    values = {} if given is None else given
+    values, gains = {} if given is None else given, {gain for law in laws for gain in law.gain_names}
     if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
         raise ValueError(f'{argument} must map names of parameters to values, got {short(given, repr)}')
     nodes: dict[str, tuple[str, NodeParameters]] = {
@@ -191,8 +198,8 @@ def checked_parameters(argument: str, given: Mapping[str, Any] | None) -> dict[s
         if name in others.declared():
             raise UserError(f'{name!r} is a parameter of {other}: give it in {place}')
         # Controllers that are installed have parameters once they are chosen.
-        if node == 'virtual_robot' or name not in names_of_gains():
-            raise UserError(f'{node} has no {next(unknown([name], known))}')
+        if node == 'virtual_robot' or name not in names_of_gains() | gains:
+            raise UserError(f'{node} has no {next(unknown([name], known | gains))}')
     return {name: one.item() if isinstance(one, np.generic) else one for name, one in values.items()}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
 NAME = 'drive_to'
 """Name of the node that sends the goals."""
+NO_LAWS: Mapping[str, Any] = MappingProxyType({})
 DISCOVERY_PERIOD = 0.5
 """Time between two searches for new topics to record (s)."""
 
@@ -117,7 +119,7 @@ def drive(
             )
         context = runner.context
         ours = robot, bridge, controller = add_nodes(
-            runner, request.parameters, request.robot_parameters
+            runner, request.parameters, request.robot_parameters, request.laws
         )
         values = {one.get_fully_qualified_name(): one.parameters.by_name() for one in ours}
         client = runner.add(lambda: GoalClient(NAME, request.goals, context, relative=request.relative))
@@ -192,7 +194,10 @@ def drive(
 
 
 def add_nodes(
-    runner: NodeRunner, parameters: Mapping[str, Any], robot_parameters: Mapping[str, Any]
+    runner: NodeRunner,
+    parameters: Mapping[str, Any],
+    robot_parameters: Mapping[str, Any],
+    laws: Mapping[str, Any] = NO_LAWS,
 ) -> tuple[VirtualRobot, WheelBridge, GoToGoal]:
     """Add a robot that is driven by its wheels, the bridge and the controller to a runner.
 
@@ -200,13 +205,14 @@ def add_nodes(
         runner: Runs the nodes.
         parameters: Parameters of go_to_goal, by name.
         robot_parameters: Likewise of virtual_robot.
+        laws: As of a `Request`.
     """
     of_robot = overrides({**robot_parameters, 'command_interface': 'wheels'})
     of_controller, how = overrides(parameters), {'context': runner.context}
     return (
         runner.add(lambda: VirtualRobot(**how, parameter_overrides=of_robot)),
         runner.add(lambda: WheelBridge(**how)),
-        runner.add(lambda: GoToGoal(**how, parameter_overrides=of_controller)),
+        runner.add(lambda: GoToGoal(**how, **laws, parameter_overrides=of_controller)),
     )
 
 

@@ -169,6 +169,8 @@ class Request:
     """Poses, shape (n, 3), or a path."""
     relative: bool
     timeout: float
+    laws: Mapping[str, Any]
+    """Laws of the caller's own, a `controller` or a `path_controller`."""
     parameters: Mapping[str, Any]
     robot_parameters: Mapping[str, Any]
     recording: Recording | None

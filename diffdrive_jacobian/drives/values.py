@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -136,8 +137,11 @@ class World:
         robot_parameters: Mapping[str, Any],
         ros_arguments: Sequence[str],
         start: int,
+        laws: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         """Start at a time (ns), with parameters of controller and robot, and those of ROS arguments.
+
+        `laws` are those of a `Request`.
 
         Raises:
             UserError: The parameters or the ROS arguments are invalid.
@@ -154,7 +158,8 @@ class World:
                 {**given['/virtual_robot'], **robot_parameters, **interface}
             )
             of_bridge = WheelBridgeParameters().at_start(given['/wheel_bridge'])
-            of_driver = GoToGoalParameters().at_start({**given['/go_to_goal'], **parameters})
+            defaults = GoToGoalParameters().with_laws(**laws)
+            of_driver = defaults.at_start({**given['/go_to_goal'], **parameters})
         except ParameterError as error:
             raise UserError(str(error)) from error
         nodes = of_robot, of_bridge, of_driver
@@ -269,7 +274,7 @@ def drive(request: Request, *, lockstep: bool, ros_arguments: Sequence[str] = ()
     """
     signals, progress = request.signals, request.progress
     start = START if lockstep else time.time_ns()
-    world = World(request.parameters, request.robot_parameters, ros_arguments, start)
+    world = World(request.parameters, request.robot_parameters, ros_arguments, start, request.laws)
     pace = (lambda _: None) if lockstep else in_real_time()
     parameters, kept = world.parameters, list[tuple[int, str, Any]]()
     if request.recording is not None:

@@ -92,11 +92,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 has the name of a built-in one.
             ParameterError: The parameters given are not a valid set.
         """
-        defaults = GoToGoalParameters()
-        if controller is not None:
-            defaults = defaults.with_controller(controller)
-        if path_controller is not None:
-            defaults = defaults.with_path_controller(path_controller)
+        defaults = GoToGoalParameters().with_laws(controller, path_controller)
         super().__init__('go_to_goal', defaults, **kwargs)
         self._goal: ActiveGoal | None = None
         self._goals_received = 0

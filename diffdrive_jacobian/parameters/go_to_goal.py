@@ -179,6 +179,13 @@ class GoToGoalParameters(TwistParameters):
         known = self.path_controllers.with_controller(controller)
         return replace(self, path_controllers=known, path_controller=controller.name)
 
+    def with_laws(
+        self, controller: Controller | None = None, path_controller: PathController | None = None
+    ) -> GoToGoalParameters:
+        """Return these with further controllers, as `with_controller`. None: there is none."""
+        found = self if controller is None else self.with_controller(controller)
+        return found if path_controller is None else found.with_path_controller(path_controller)
+
     def declared(self) -> dict[str, Parameter]:
         """Return the parameters by their ROS names, with the gains of the controllers."""
         found = {**TwistParameters.declared(self), **self.more_gains.declared()}

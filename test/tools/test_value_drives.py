@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.bags import read_run, verify
+from diffdrive_jacobian.control import KP, KV, Controller, Gain
+from diffdrive_jacobian.control.controllers import find_controller, find_path_controller
 from diffdrive_jacobian.control.path_source import PathError
 from diffdrive_jacobian.drives import drive, driving, nodes, values
 from diffdrive_jacobian.drives.driving import as_goals
@@ -24,6 +26,7 @@ LIMITS = {
     for axis, value in (('linear.x', 0.4), ('angular.z', 1.5))
     for limit, sign in (('max_acceleration', 1.0), ('max_deceleration', -1.0))
 }
+go_to_goal_law = find_controller('go_to_goal').law
 SERIES = (
     *('odometry', 'ground_truth', 'cmd_vel', 'cmd_vel_out', 'start_pose', 'wheel_commands', 'wheels'),
     *('goals', 'planned_path', 'goal_status'),
@@ -34,13 +37,24 @@ BRIDGE = [word for name, value in LIMITS.items() for word in ('-p', f'wheel_brid
 
 def request(goals, timeout=2.5, **given):
     relative = isinstance(goals, str)
-    how = {'parameters': {}, 'robot_parameters': {}, 'recording': None, 'progress': None, 'keep': True}
+    how = {'parameters': {}, 'robot_parameters': {}, 'laws': {}}
+    how |= {'recording': None, 'progress': None, 'keep': True}
     return Request(
         goals=as_goals(goals), relative=relative, timeout=timeout, signals=Signals(), **{**how, **given}
     )
 
 
+def spiral(poses, goals, kp, kv, boost, state, dt):
+    """Drive ever faster. Its gain and its state are its own."""
+    v, omega = go_to_goal_law(poses, goals, kp, kv)
+    return v * (1.0 + boost * state[..., 0]), omega, state + dt
+
+
+SPIRAL = Controller(
+    name='spiral', law=spiral, gains=(KP, KV, Gain(name='boost', default=0.5)), state=(0.0,)
+)
 CASES = {
+    'a law of the caller': {'laws': {'controller': SPIRAL}, 'parameters': {**QUICK, 'boost': 0.7}},
     'goals': {'parameters': QUICK},
     'goals passed by a robot that slips': {
         'parameters': {**QUICK, 'pass_waypoints': True},
@@ -103,8 +117,8 @@ CASES = {
 
 @pytest.mark.parametrize('name', CASES)
 def test_it_drives_as_the_nodes_in_lockstep(name):
-    case = {'goals': TO, 'parameters': {}, 'robot': {}, 'arguments': [], **CASES[name]}
-    how = {'parameters': case['parameters'], 'robot_parameters': case['robot']}
+    case = {'goals': TO, 'parameters': {}, 'robot': {}, 'arguments': [], 'laws': {}, **CASES[name]}
+    how = {'parameters': case['parameters'], 'robot_parameters': case['robot'], 'laws': case['laws']}
     arguments = ['--ros-args', '--log-level', 'fatal', *case['arguments']]
     with_nodes = {'runner': None, 'lockstep': True, 'isolated': True}
     one = nodes.drive(request(case['goals'], **how), ros_arguments=arguments, **with_nodes)
@@ -235,6 +249,21 @@ def test_an_outcome_shows_its_run():
             run_figure(wrong)
     with pytest.raises(ValueError, match='the run was not kept'):
         replace(outcome, kept=None).plot()
+
+
+@pytest.mark.parametrize('ros', [True, False])
+def test_a_law_of_the_caller_drives_with_its_gains(monkeypatch, ros):
+    monkeypatch.setattr(driving, 'has_ros', lambda: ros)
+    outcome = drive(TO, controller=SPIRAL, parameters={**QUICK, 'boost': 0.7}, lockstep=True)
+    assert outcome.arrived
+    used = outcome.run.of_node('go_to_goal')
+    assert (used['controller'], used['boost']) == ('spiral', 0.7)
+    along = replace(find_path_controller('kanayama'), name='mine')
+    assert drive('circle:0.3', path_controller=along, lockstep=True).arrived
+    with pytest.raises(UserError, match="no parameter 'boast'; did you mean 'boost'"):
+        drive(TO, controller=SPIRAL, parameters={'boast': 0.7}, lockstep=True)
+    with pytest.raises(ValueError, match="a name of its own, got 'pose'"):
+        drive(TO, controller=replace(SPIRAL, name='pose'), lockstep=True)
 
 
 def test_a_text_is_a_path(tmp_path):
