@@ -22,6 +22,7 @@ COMMANDS = [
     'sweep_gains',
     'doctor',
     'calibrate_run',
+    'grade_hand_ins',
 ]
 MESSAGES = '5.3.6'
 CORE_MESSAGES = '2.0.3'
@@ -73,6 +74,7 @@ setup(
             f'ros-std-srvs=={MESSAGES}',
             'ros-unique-identifier-msgs==2.5.0',
         ],
+        'testing': ['hypothesis>=6', 'pytest>=7'],
         'doc': ['pdoc>=15'],
         'explore': ['hypothesis>=6'],
         'live': ['websockets>=15'],
@@ -93,7 +95,11 @@ setup(
         # Each name is that of the module, so that `pytest_plugins` with it does not load it twice.
         'pytest11': [
             f'{module} = {module}'
-            for module in (f'{PACKAGE}.testing.fixtures', f'{PACKAGE}.robot_testing.fixtures')
+            for module in (
+                f'{PACKAGE}.testing.fixtures',
+                f'{PACKAGE}.robot_testing.fixtures',
+                f'{PACKAGE}.grading.plugin',
+            )
         ],
         f'{PACKAGE}.fault_kinds': [f'robot = {PACKAGE}.robot_testing.fault_kinds:KINDS'],
         f'{PACKAGE}.pictures': [f'run = {PACKAGE}.robot_testing.pictures:draw_run'],

@@ -1,0 +1,52 @@
+"""Answers of a hand-in: how they are shown, and whether they are right."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+LONGEST = 160
+"""Longest text of a value (characters)."""
+
+
+def shown(value: Any) -> str:
+    """Return a value as a student would write it, with six digits, cut to a length."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    text = _text(value)
+    return text if len(text) <= LONGEST else f'{text[: LONGEST - 4]} ...'
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return f'[{", ".join(map(_text, value))}]'
+    return f'{value:.6g}' if isinstance(value, float) else repr(value)
+
+
+def agree(found: Any, expected: Any, what: str, *, within: float = 1e-6) -> None:
+    """Require that an answer is right.
+
+    Args:
+        found: The answer: a number, or nested lists or arrays of numbers.
+        expected: What it must be.
+        what: What it is, for the message.
+        within: Largest difference, relative to 1 and to the largest expected number.
+
+    Raises:
+        AssertionError: It is not. The message is for the student.
+    """
+    wanted = np.asarray(expected, dtype=np.float64)
+    try:
+        got = None if found is None else np.asarray(found, dtype=np.float64)
+    except (TypeError, ValueError):
+        got = None
+    if got is None:
+        raise AssertionError(f'{what} must be {shown(wanted)}, got {shown(found)}')
+    if got.shape != wanted.shape:
+        raise AssertionError(
+            f'{what} must have shape {wanted.shape}, as {shown(wanted)}, got {got.shape}: {shown(got)}'
+        )
+    largest = max(1.0, float(np.max(np.abs(wanted), initial=0.0)))
+    if not np.all(np.abs(got - wanted) <= within * largest):
+        raise AssertionError(f'{what} must be {shown(wanted)}, got {shown(got)}')

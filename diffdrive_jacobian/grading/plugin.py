@@ -1,0 +1,145 @@
+"""The plugin of pytest: the hand-in as a fixture, and points of tests."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import pytest
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.grading.hand_in import HandIn
+
+SavePicture: TypeAlias = Callable[[Any], None]
+"""What the fixture `save_picture` is: it takes a figure."""
+REPORT = pytest.StashKey['Report']()
+BROKEN = pytest.StashKey['HandInError']()
+"""Why the hand-in cannot be run."""
+
+
+@dataclass
+class Grade:
+    """What one test has given."""
+
+    test: str
+    """Its name without `test_`."""
+    task: str
+    """First line of its docstring."""
+    points: float
+    """What it gave."""
+    of: float
+    """What it can give. 0: it was not graded."""
+    reason: str
+    """Why it gave less, or was not graded. Empty: it gave all."""
+
+
+class Report:
+    """The grades of one hand-in."""
+
+    def __init__(self) -> None:
+        """Start without grades."""
+        self.grades: list[Grade] = []
+
+    @property
+    def points(self) -> tuple[float, float]:
+        """What was given, and what could be."""
+        return sum(one.points for one in self.grades), sum(one.of for one in self.grades)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options."""
+    group = parser.getgroup('grading', 'diffdrive_jacobian.grading')
+    group.addoption('--hand-in', type=Path, metavar='FILE', help='hand-in that the exercise grades')
+    group.addoption('--grades', type=Path, metavar='FILE', help='JSON file to write its points to')
+    group.addoption('--pictures', type=Path, metavar='DIR', help='where to save pictures of the hand-in')
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the marker."""
+    text = 'points(number): what a test of an exercise gives if it passes (default: 1)'
+    config.addinivalue_line('markers', text)
+    config.stash[REPORT] = Report()
+
+
+@pytest.fixture
+def hand_in(request: pytest.FixtureRequest) -> Iterator[HandIn]:
+    """The hand-in of the option --hand-in, in a process of its own for each test."""
+    from diffdrive_jacobian.grading.hand_in import HandIn, HandInError
+
+    path = request.config.getoption('--hand-in')
+    if path is None:
+        pytest.fail('an exercise grades a hand-in: give it by --hand-in FILE', pytrace=False)
+    broken = request.config.stash.get(BROKEN, None)
+    if broken is not None:
+        raise broken
+    try:
+        found = HandIn(path)
+    except HandInError as error:
+        # Not again for each test: it may have taken long.
+        request.config.stash[BROKEN] = error
+        raise
+    yield found
+    found.close()
+
+
+@pytest.fixture
+def save_picture(request: pytest.FixtureRequest) -> SavePicture:
+    """A function that saves a figure below the folder of --pictures; without it, it does nothing."""
+
+    def save(figure: Any) -> None:
+        folder = request.config.getoption('--pictures')
+        if folder is None:
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        figure.savefig(folder / f'{request.config.getoption("--hand-in").stem}.png')
+
+    return save
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+    """Note what a test gave."""
+    outcome = yield
+    report = outcome.get_result()  # type: ignore[attr-defined]
+    if 'hand_in' not in getattr(item, 'fixturenames', ()):
+        return
+    if report.when != 'call' and report.passed:
+        return
+    marker = item.get_closest_marker('points')
+    of = float(marker.args[0]) if marker is not None and marker.args else 1.0
+    reason = ''
+    if report.skipped:
+        of, reason = 0.0, f'not graded: {call.excinfo.value if call.excinfo else "skipped"}'
+    elif call.excinfo is not None:
+        error = call.excinfo.value
+        text = str(error).strip().partition('\n')[0]
+        own = isinstance(error, (AssertionError, pytest.fail.Exception))
+        reason = text if own else f'{type(error).__name__}: {text}'
+    doc = getattr(getattr(item, 'function', None), '__doc__', None) or item.name
+    task = doc.strip().partition('\n')[0].rstrip('.')
+    name = item.name.removeprefix('test_')
+    given = of if report.passed else 0.0
+    item.config.stash[REPORT].grades.append(Grade(name, task, given, of, reason))
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Print the points of the hand-in, in a student's words."""
+    report = config.stash[REPORT]
+    if not report.grades:
+        return
+    points, of = report.points
+    terminalreporter.section(f'{config.getoption("--hand-in")}: {points:g} of {of:g} points')
+    for one in report.grades:
+        reason = f': {one.reason}' if one.reason else ''
+        terminalreporter.line(f'{one.points:g}/{one.of:g}  {one.task}{reason}')
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write the points for `grade_hand_ins`."""
+    path = session.config.getoption('--grades')
+    if path is not None:
+        grades = session.config.stash[REPORT].grades
+        path.write_text(json.dumps([asdict(one) for one in grades]), encoding='utf-8')

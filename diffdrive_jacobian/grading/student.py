@@ -1,0 +1,155 @@
+"""The process of a hand-in. It is run as a program, and imports nothing of this package.
+
+It reads requests from its input, one JSON array each, calls a function of the hand-in, and writes the
+answer. Before anything of the hand-in runs, it gives up what a law does not need: files, the network and
+other processes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import json
+import os
+import sys
+from typing import Any
+
+import numpy as np
+
+resource: Any = None
+# Windows has none.
+with contextlib.suppress(ImportError):
+    import resource
+
+MODULES = (
+    *('abc', 'bisect', 'cmath', 'collections', 'collections.abc', 'copy', 'dataclasses', 'enum'),
+    *('fractions', 'functools', 'heapq', 'itertools', 'math', 'numbers', 'operator', 'random'),
+    *('statistics', 'string', 'textwrap', 'time', 'typing', 'warnings'),
+    *('numpy', 'numpy.fft', 'numpy.linalg', 'numpy.polynomial', 'numpy.random'),
+)
+"""What a hand-in may import. It is imported before, because no file can be opened after."""
+MEMORY = 4 << 30
+"""Largest address space (bytes)."""
+LONGEST = 1_000_000
+"""Largest size of an answer (characters)."""
+
+
+def fence(event: str, args: tuple[object, ...]) -> None:
+    """Refuse what a hand-in need not do. It is for mistakes and for the curious: the limits follow."""
+    # Only what cannot be replaced: literals, and methods of str.
+    if event == 'import':
+        raise ImportError('', name=args[0])  # type: ignore[arg-type]
+    if event in {'open', 'os.listdir', 'os.scandir', 'os.remove', 'os.rename', 'os.mkdir', 'os.rmdir'}:
+        raise PermissionError('opens or changes a file')
+    if event.startswith(('socket.', 'urllib.', 'ftplib.', 'http.', 'smtplib.')):
+        raise PermissionError('uses the network')
+    if event.startswith(('subprocess.', 'os.exec', 'os.fork', 'os.posix_spawn', 'os.spawn', 'pty.')):
+        raise PermissionError('starts another program')
+    if event in {'os.system', 'os.kill', 'os.killpg', 'signal.pthread_kill', 'os.startfile'}:
+        raise PermissionError('starts or ends another program')
+    if event.startswith(('ctypes.', 'gc.', 'sys.settrace', 'sys.setprofile', 'os.putenv', 'os.chdir')):
+        raise PermissionError('changes how Python works')
+
+
+def limit(seconds: int) -> None:
+    """Limit what the process can use, where the system can: no further file, no memory without end."""
+    if resource is None:
+        return
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    # macOS has a limit of the address space that is no limit.
+    if sys.platform == 'linux':
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    # Those that are open stay open.
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
+
+
+def described(error: BaseException, name: str) -> str:
+    """Return what went wrong in words, with the line of the hand-in."""
+    if isinstance(error, ImportError):
+        return f'imports {error.name}, and may import numpy and what computes in the standard library'
+    line, trace = 0, error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == name:
+            line = trace.tb_lineno
+        trace = trace.tb_next
+    if isinstance(error, SyntaxError) and error.filename == name:
+        line = error.lineno or 0
+    text = error.msg if isinstance(error, SyntaxError) else str(error)
+    what = text if isinstance(error, PermissionError) else f'{type(error).__name__}: {text}'
+    return f'{what[:300]} (line {line})' if line else what[:300]
+
+
+def plain(value: object) -> object:
+    """Return a result as JSON has it, or raise TypeError."""
+    if isinstance(value, np.ndarray):
+        return {'array': plain(value.tolist()), 'shape': value.shape}
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, (list, tuple)):
+        return [plain(one) for one in value]
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f'must return numbers, arrays, lists or texts, got {type(value).__name__}')
+
+
+def given(value: object) -> object:
+    """Return an argument: arrays are marked."""
+    if isinstance(value, dict):
+        return np.array(value['array'], dtype=float).reshape(value['shape'])
+    return [given(one) for one in value] if isinstance(value, list) else value
+
+
+def main() -> None:
+    """Serve requests until the input ends."""
+    path, seconds = sys.argv[1], int(sys.argv[2])
+    requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), 'w')
+    with open(path, encoding='utf-8', errors='replace') as file:
+        source = file.read()
+    for needed in MODULES:
+        importlib.import_module(needed)
+
+    def answer(kind: str, value: object) -> None:
+        text = json.dumps([kind, value])
+        if len(text) > LONGEST:
+            text = json.dumps(['failed', f'must return less than {LONGEST} characters, got {len(text)}'])
+        answers.write(text + '\n')
+        answers.flush()
+
+    # What a hand-in prints is not for anybody, and it may be endless.
+    devnull = os.open(os.devnull, os.O_WRONLY)
+    for number in (1, 2):
+        os.dup2(devnull, number)
+    sys.stdout = sys.stderr = io.TextIOWrapper(_Nowhere(), encoding='utf-8')
+    name = os.path.basename(path)
+    limit(seconds)
+    sys.addaudithook(fence)
+    answer('loaded', None)
+    module: dict[str, Any] = {'__name__': 'hand_in', '__file__': name}
+    try:
+        exec(compile(source, name, 'exec'), module)
+    except BaseException as error:
+        answer('broken', described(error, name))
+        return
+    names = [one for one, value in module.items() if callable(value) and not one.startswith('_')]
+    answer('ready', names)
+    for line in requests:
+        function, arguments = json.loads(line)
+        try:
+            answer('value', plain(module[function](*map(given, arguments))))
+        except BaseException as error:
+            answer('failed', described(error, name))
+
+
+class _Nowhere(io.RawIOBase):
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: object) -> int:
+        return len(data)  # type: ignore[arg-type]
+
+
+if __name__ == '__main__':
+    main()
