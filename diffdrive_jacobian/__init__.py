@@ -11,6 +11,7 @@ __all__ = [
     'drives',
     'errors',
     'faults',
+    'grading',
     'kinematics',
     'nodes',
     'numerics',

@@ -29,7 +29,7 @@ def test_task(hand_in: HandIn) -> None:
     """The task is done exactly, whatever else is wanted."""
     for J in JACOBIANS:
         task, wanted = RANDOM.normal(size=2), RANDOM.normal(size=J.shape[1])
-        found = hand_in.array('velocities', J, task, wanted, shape=wanted.shape)
+        found = hand_in.array('velocities', J, task, wanted, shape=(J.shape[1],))
         agree(J @ found, task, 'J times the velocities')
 
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,8 @@ class HandIn:
         )
         # One answer at a time: a flood waits in the pipe.
         self._answers: queue.Queue[bytes] = queue.Queue(1)
-        threading.Thread(target=self._receive, daemon=True).start()
+        self._thread = threading.Thread(target=self._receive, daemon=True)
+        self._thread.start()
         self._names: list[str] = []
         what = f'{self.path.name}'
         self._answer(what, START)
@@ -75,6 +77,7 @@ class HandIn:
             line = self._process.stdout.readline(2 * student.LONGEST)
             self._answers.put(line)
             if not line:
+                self._process.stdout.close()
                 return
 
     def _answer(self, what: str, seconds: float) -> tuple[str, Any]:
@@ -158,6 +161,10 @@ class HandIn:
         """End the process."""
         self._process.kill()
         self._process.wait()
+        while self._thread.is_alive():
+            # It may wait for somebody to take an answer.
+            with suppress(queue.Empty):
+                self._answers.get(timeout=0.01)
         for pipe in (self._process.stdin, self._process.stderr):
             if pipe is not None:
                 pipe.close()

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.grading.hand_in import HandIn
 
-SavePicture: TypeAlias = Callable[[Any], None]
-"""What the fixture `save_picture` is: it takes a figure."""
 REPORT = pytest.StashKey['Report']()
 BROKEN = pytest.StashKey['HandInError']()
 """Why the hand-in cannot be run."""
+
+
+class SavePicture(Protocol):
+    """What the fixture `save_picture` is."""
+
+    def __call__(self, figure: Any) -> None:
+        """Save a figure where --pictures says, under the name of the hand-in."""
 
 
 @dataclass

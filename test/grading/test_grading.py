@@ -1,0 +1,144 @@
+"""Exercises with their solutions, and tables of many hand-ins."""
+
+from __future__ import annotations
+
+import csv
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from support.commands import refused, run
+
+from diffdrive_jacobian.grading.grader import exercises, find_exercise
+
+pytestmark = pytest.mark.process
+
+PAGE = Path(__file__).parents[2] / 'doc' / 'solutions.md'
+SOLUTIONS = dict(re.findall(r'```python\n# (\w+)\.py\n(.*?)```', PAGE.read_text(), flags=re.DOTALL))
+WRONG = {
+    'wheels': ('r / L, -r / L', '-r / L, r / L'),
+    'angles': ('np.arctan2(np.sin(angle), np.cos(angle))', 'angle % (2 * np.pi)'),
+    'gains': ('6.0, 1.5', '1.5, 6.0'),
+    'three_laws': ('0.5 * math.hypot(dx, dy), 3.0 * error', '0.5 * math.hypot(dx, dy)'),
+    'offset_point': ('-sine / d', 'sine / d'),
+    'damping': ('damping**2', 'damping'),
+    'null_space': ('+ projector(J) @ wanted', '+ wanted'),
+    'limits': ('v / scale, omega / scale', 'v / scale, omega'),
+    'eight': ('2.0 * along, omega', '2.0 * along + omega'),
+    'lost_odometry': ('age > 0.3', 'age > 3.0'),
+}
+"""What a student may write instead."""
+
+
+def grade(exercise, folder, *sources, options=()):
+    """Grade hand-ins, and return the output and the rows of the table."""
+    names = []
+    for number, source in enumerate(sources):
+        names.append(f'student_{number}.py')
+        (folder / names[-1]).write_text(source)
+    table = folder / 'points.csv'
+    ended = run('grade_hand_ins', exercise, *(folder / name for name in names), '--csv', table, *options)
+    assert ended.err == ''
+    with table.open() as file:
+        return ended, list(csv.DictReader(file))
+
+
+def test_each_exercise_has_a_solution_and_a_mistake():
+    assert exercises() == sorted(SOLUTIONS) == sorted(WRONG)
+
+
+@pytest.mark.parametrize('name', sorted(WRONG))
+def test_the_solution_has_all_points_and_a_mistake_has_not(tmp_path, name):
+    right, (old, new) = SOLUTIONS[name], WRONG[name]
+    assert old in right
+    ended, (good, bad) = grade(name, tmp_path, right, right.replace(old, new))
+    assert ended.code == 0
+    assert good['points'] == good['of'] != '0', ended.out
+    assert good['reasons'] == ''
+    assert float(bad['points']) < float(bad['of'])
+    assert bad['reasons']
+
+
+EXERCISE = """
+import pytest
+from diffdrive_jacobian.grading import agree
+
+@pytest.mark.points(2)
+def test_twice(hand_in):
+    '''Twice a number.'''
+    agree(hand_in.call('twice', 3.0), 6.0, 'twice(3)')
+
+def test_thrice(hand_in, save_picture):
+    '''Three times a number.'''
+    from matplotlib.figure import Figure
+    agree(hand_in.call('thrice', 3.0), 9.0, 'thrice(3)')
+    save_picture(Figure())
+
+@pytest.mark.skip('no robot')
+@pytest.mark.points(5)
+def test_robot(hand_in):
+    '''A robot.'''
+"""
+
+
+def test_a_table_has_points_and_reasons_that_no_spreadsheet_obeys(tmp_path):
+    exercise = tmp_path / 'exercise.py'
+    exercise.write_text(EXERCISE)
+    sources = (
+        'def twice(a): return 2 * a\ndef thrice(a): return 3 * a\n',
+        'def twice(a): return 2 * a\ndef thrice(a): raise ValueError("=cmd()")\n',
+        'def twice(a):\n    while True: pass\n',
+        'import socket\n',
+    )
+    pictures = tmp_path / 'pictures'
+    ended, rows = grade(exercise, tmp_path, *sources, options=('--pictures', pictures))
+    assert ended.code == 0
+    assert [row['points'] for row in rows] == ['3', '2', '0', '0']
+    assert {row['of'] for row in rows} == {'3'}
+    assert [rows[1][name] for name in ('twice', 'thrice', 'robot')] == ['2', '0', '0']
+    assert rows[0]['reasons'] == 'A robot: not graded: no robot'
+    assert 'Three times a number: thrice(3): ValueError: =cmd()' in rows[1]['reasons']
+    assert 'took longer than 5 s' in rows[2]['reasons']
+    assert 'student_3.py cannot be run: imports socket' in rows[3]['reasons']
+    assert [one.name for one in pictures.iterdir()] == ['student_0.png']
+    with Image.open(pictures / 'student_0.png') as picture:
+        assert picture.width > 100
+    assert '3 of 3' in ended.out
+
+
+def test_a_hand_in_that_is_not_graded_in_time_is_an_error_of_its_own(tmp_path):
+    (tmp_path / 'slow.py').write_text('import time\ndef test_slow(hand_in): time.sleep(60)\n')
+    (tmp_path / 'anna.py').write_text('')
+    ended = run('grade_hand_ins', tmp_path / 'slow.py', tmp_path / 'anna.py', '--timeout', 3)
+    assert ended.code == 1
+    assert 'not graded: it took longer than 3 s' in ended.out
+
+
+def test_mistakes_of_the_lecturer_are_named(tmp_path):
+    (tmp_path / 'broken.py').write_text('1 / 0\n')
+    (tmp_path / 'empty.py').write_text('')
+    (tmp_path / 'anna.py').write_text('')
+    anna = tmp_path / 'anna.py'
+    assert 'EXERCISE must be a file, or one of angles' in refused('grade_hand_ins', 'whels', anna)
+    assert 'there is no exercise' in refused('grade_hand_ins', tmp_path / 'none.py', anna)
+    assert 'there is no hand-in' in refused('grade_hand_ins', 'wheels', tmp_path / 'none.py')
+    for name, words in (('broken', 'ZeroDivisionError'), ('empty', 'grades nothing')):
+        assert words in refused('grade_hand_ins', tmp_path / f'{name}.py', anna, code=1)
+    (tmp_path / 't.csv').write_text('')
+    assert 'exists already' in refused('grade_hand_ins', 'wheels', anna, '--csv', tmp_path / 't.csv')
+
+
+def test_the_same_by_pytest_alone(tmp_path):
+    (tmp_path / 'anna.py').write_text(SOLUTIONS['wheels'].replace('r / L, -r / L', 'r, r'))
+    command = [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', find_exercise('wheels')]
+    ended = subprocess.run(
+        [*command, '--hand-in', 'anna.py'], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 1
+    assert 'anna.py: 2 of 5 points' in ended.stdout
+    assert '0/2  J_w maps the speeds of the right and the left wheel to v and omega: ' in ended.stdout
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert 'give it by --hand-in FILE' in ended.stdout
