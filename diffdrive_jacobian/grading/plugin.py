@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.grading.hand_in import HandIn
 
 REPORT = pytest.StashKey['Report']()
-BROKEN = pytest.StashKey['HandInError']()
+BROKEN = pytest.StashKey[Exception]()
 """Why the hand-in cannot be run."""
 
 
