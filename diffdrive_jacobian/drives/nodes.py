@@ -198,6 +198,7 @@ def add_nodes(
     parameters: Mapping[str, Any],
     robot_parameters: Mapping[str, Any],
     laws: Mapping[str, Any] = NO_LAWS,
+    namespace: str = '/',
 ) -> tuple[VirtualRobot, WheelBridge, GoToGoal]:
     """Add a robot that is driven by its wheels, the bridge and the controller to a runner.
 
@@ -206,9 +207,11 @@ def add_nodes(
         parameters: Parameters of go_to_goal, by name.
         robot_parameters: Likewise of virtual_robot.
         laws: As of a `Request`.
+        namespace: Namespace of the nodes.
     """
     of_robot = overrides({**robot_parameters, 'command_interface': 'wheels'})
-    of_controller, how = overrides(parameters), {'context': runner.context}
+    of_controller = overrides(parameters)
+    how: dict[str, Any] = {'context': runner.context, 'namespace': namespace}
     return (
         runner.add(lambda: VirtualRobot(**how, parameter_overrides=of_robot)),
         runner.add(lambda: WheelBridge(**how)),
@@ -249,15 +252,22 @@ class KeptMessages:
         """Ignore that a topic is of another type."""
 
 
-def recorder_of(runner: NodeRunner, recording: Sink | None) -> Callable[[], None]:
+def recorder_of(
+    runner: NodeRunner, recording: Sink | None, selection: Selection | None = None
+) -> Callable[[], None]:
     """Record what the nodes publish, if there is a recording.
+
+    Args:
+        runner: Runs the nodes.
+        recording: The recording.
+        selection: What is recorded. None: what a single robot publishes.
 
     Returns:
         A function that finds new topics, to be called often.
     """
     if recording is None:
         return lambda: None
-    recorder = runner.add(lambda: Recorder(Selection(), recording, context=runner.context))
+    recorder = runner.add(lambda: Recorder(selection or Selection(), recording, context=runner.context))
     discovery = TokenBucket(1, DISCOVERY_PERIOD)
 
     def discover() -> None:

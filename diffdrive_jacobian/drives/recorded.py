@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from rosbags.interfaces import (
@@ -21,6 +21,7 @@ from diffdrive_jacobian.bags.message_definitions import known_definition, known_
 from diffdrive_jacobian.messages.cdr import Writer
 from diffdrive_jacobian.messages.codecs import Changes, Route, Status
 from diffdrive_jacobian.messages.conversion import set_time
+from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.messages.structure import blank
 from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
@@ -35,29 +36,47 @@ _FOREVER = QosTime(9223372036, 854775807)
 class ValueRecorder:
     """Records messages that are given as their values."""
 
-    def __init__(self, recording: Recording, parameters: Mapping[str, Mapping[str, Any]]) -> None:
-        """Record the parameters of the nodes, by their names."""
+    def __init__(
+        self,
+        recording: Recording,
+        parameters: Mapping[str, Mapping[str, Any]],
+        namespace: str,
+        numbers: Iterator[int],
+    ) -> None:
+        """Record the parameters of the nodes, by their full names.
+
+        Args:
+            recording: The recording.
+            parameters: Values of the parameters by name, of each node.
+            namespace: Namespace of the topics.
+            numbers: Of the topics; each is used once in a recording.
+        """
         for node, values in parameters.items():
             recording.add(Text(PARAMETERS + node, json.dumps(values)))
         self._recording = recording
-        self._of_robot, self._of_bridge = parameters['/virtual_robot'], parameters['/wheel_bridge']
+        self._namespace, self._numbers = namespace, numbers
+        self._of_robot, self._of_bridge = (
+            parameters[full_name(namespace, name)] for name in ('virtual_robot', 'wheel_bridge')
+        )
         self._topics: dict[str, tuple[int, Callable[[Any], bytes]]] = {}
 
     def add(self, now: int, topic: str, value: Any) -> None:
         """Record a message that was published at a time (ns)."""
         if topic not in self._topics:
-            self._topics[topic] = len(self._topics) + 1, self._open(topic, len(self._topics) + 1)
+            number = next(self._numbers)
+            self._topics[topic] = number, self._open(topic, number)
         number, write = self._topics[topic]
         self._recording.add(Message(number, now, write(value)))
 
     def _open(self, name: str, number: int) -> Callable[[Any], bytes]:
         """Record that there is a topic; return what serializes its messages."""
-        codec = (TOPICS.get(name) or TOPICS[f'/{name}']).codecs[0]
+        known = TOPICS.get(name) or TOPICS[f'/{name}']
+        codec = known.codecs[0]
         described = known_definition(codec.type_name)
         self._recording.add(
             Channel(
                 id=number,
-                topic=f'/{name}',
+                topic=full_name('/' if known.shared else self._namespace, name),
                 type_name=codec.type_name,
                 definition=described.text,
                 type_hash=described.type_hash,

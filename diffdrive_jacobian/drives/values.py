@@ -8,6 +8,7 @@ there, so nothing gets lost, arrives late or comes from somewhere else.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import time
@@ -37,6 +38,7 @@ from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.messages.codecs import Changes, Command, Motion, Route
 from diffdrive_jacobian.messages.conversion import MessageError, from_twist
 from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.nodes.steering import STANDSTILL
 from diffdrive_jacobian.parameters.arguments import check_names, given_parameters
 from diffdrive_jacobian.parameters.declaration import ParameterError
@@ -51,7 +53,8 @@ if TYPE_CHECKING:
 
 START = NANOSECONDS
 """Time at the start, as in lockstep (ns)."""
-NODES = ('/virtual_robot', '/wheel_bridge', '/go_to_goal')
+NODES = ('virtual_robot', 'wheel_bridge', 'go_to_goal')
+"""Names of the nodes that are replaced, without namespace."""
 OF_MESSAGES = {'enable_stamped_cmd_vel', 'joint_command_type'}
 """Parameters that would have no effect."""
 LONGEST_STEP = NANOSECONDS
@@ -138,10 +141,11 @@ class World:
         ros_arguments: Sequence[str],
         start: int,
         laws: Mapping[str, Any] = MappingProxyType({}),
+        namespace: str = '/',
     ) -> None:
         """Start at a time (ns), with parameters of controller and robot, and those of ROS arguments.
 
-        `laws` are those of a `Request`.
+        `laws` are those of a `Request`. The nodes would be in the namespace.
 
         Raises:
             UserError: The parameters or the ROS arguments are invalid.
@@ -151,20 +155,24 @@ class World:
         self.observers: list[Callable[[str, Any], None]] = []
         """Each receives topic and value of every message, before the nodes do, when time `now` is."""
         self._queue: list[tuple[str, Any]] = []
-        given = given_parameters(ros_arguments, NODES)
+        self.namespace = namespace
+        self.nodes = {name: full_name(namespace, name) for name in NODES}
+        """Full names of the nodes, by their names."""
+        by_node = given_parameters(ros_arguments, self.nodes.values())
+        given = {name: by_node[node] for name, node in self.nodes.items()}
         interface = {'command_interface': 'wheels'}
         try:
             of_robot = VirtualRobotParameters().at_start(
-                {**given['/virtual_robot'], **robot_parameters, **interface}
+                {**given['virtual_robot'], **robot_parameters, **interface}
             )
-            of_bridge = WheelBridgeParameters().at_start(given['/wheel_bridge'])
+            of_bridge = WheelBridgeParameters().at_start(given['wheel_bridge'])
             defaults = GoToGoalParameters().with_laws(**laws)
-            of_driver = defaults.at_start({**given['/go_to_goal'], **parameters})
+            of_driver = defaults.at_start({**given['go_to_goal'], **parameters})
         except ParameterError as error:
             raise UserError(str(error)) from error
-        nodes = of_robot, of_bridge, of_driver
-        check_names(ros_arguments, {name for node in nodes for name in node.declared()})
-        for node in nodes:
+        parts = of_robot, of_bridge, of_driver
+        check_names(ros_arguments, {name for node in parts for name in node.declared()})
+        for node in parts:
             for name in OF_MESSAGES & node.declared().keys():
                 if node.by_name()[name] != node.declared()[name].default:
                     raise UserError(f'{name} chooses a type of messages, and needs rclpy')
@@ -186,9 +194,10 @@ class World:
 
     @property
     def parameters(self) -> dict[str, dict[str, Any]]:
-        """Values of the parameters by the names of the nodes."""
-        nodes = self.robot, self.bridge, self.driver
-        return dict(zip(NODES, (node.parameters.by_name() for node in nodes), strict=True))
+        """Values of the parameters by the full names of the nodes."""
+        parts = self.robot, self.bridge, self.driver
+        values = (part.parameters.by_name() for part in parts)
+        return dict(zip(self.nodes.values(), values, strict=True))
 
     @property
     def seconds(self) -> float:
@@ -243,13 +252,13 @@ class World:
         Raises:
             ParameterError: The value is invalid.
         """
-        changed = self.driver if node == '/go_to_goal' else self.robot
+        changed = self.driver if node == 'go_to_goal' else self.robot
         before = changed.parameters.by_name()
         parameters = changed.parameters.changed({name: value})
         # A law may have gains that were no parameters before. NaN, which is none, differs from itself.
         after = parameters.by_name().items()
         new = {one: value for one, value in after if repr(value) != repr(before.get(one))}
-        self.publish('parameter_events', Changes(node, new, self.now))
+        self.publish('parameter_events', Changes(self.nodes[node], new, self.now))
         self.settle()
         if isinstance(parameters, GoToGoalParameters):
             self.driver.change(parameters)
@@ -289,7 +298,7 @@ def drive(request: Request, *, lockstep: bool, ros_arguments: Sequence[str] = ()
     client, driver, robot = Client(request.goals, request.relative, world), world.driver, world.robot
     world.observers.append(client.observe)
     if progress is not None:
-        progress.nodes_created(NODES)
+        progress.nodes_created([*world.nodes.values()])
 
     def turns(longest: float, handled: int = 0) -> Iterator[None]:
         """As `NodeRunner.turns`."""
@@ -338,9 +347,10 @@ def drive(request: Request, *, lockstep: bool, ros_arguments: Sequence[str] = ()
     )
 
 
-def record(world: World, recording: Recording) -> None:
-    """Record what is published from now on."""
-    recorder = ValueRecorder(recording, world.parameters)
+def record(world: World, recording: Recording, numbers: Iterator[int] | None = None) -> None:
+    """Record what is published from now on. Several worlds of one recording share `numbers`."""
+    parameters, numbers = world.parameters, numbers or itertools.count(1)
+    recorder = ValueRecorder(recording, parameters, world.namespace, numbers)
     world.observers.append(lambda topic, value: recorder.add(world.now, topic, value))
 
 

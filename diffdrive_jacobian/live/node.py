@@ -19,6 +19,7 @@ from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.drives.nodes import DISCOVERY_PERIOD as RECORDED_PERIOD
 from diffdrive_jacobian.drives.nodes import add_nodes, in_lockstep, in_real_time, recorder_of
 from diffdrive_jacobian.live.commands import Command, RobotCommand
+from diffdrive_jacobian.live.fleet import PATTERN, Member, members
 from diffdrive_jacobian.live.live_robot import LiveRobot
 from diffdrive_jacobian.live.pacing import Pacing, control_time
 from diffdrive_jacobian.live.robot_state import GoalEnd
@@ -27,7 +28,7 @@ from diffdrive_jacobian.live.session import Session, Snapshot
 from diffdrive_jacobian.lockstep.runner import LockstepRunner
 from diffdrive_jacobian.messages.codecs import PARAMETER_EVENT, Changes
 from diffdrive_jacobian.messages.names import base_name, full_name, is_named, namespace_of, node_of
-from diffdrive_jacobian.messages.topics import PARAMETER_EVENTS, TOPICS
+from diffdrive_jacobian.messages.topics import PARAMETER_EVENTS, TOPICS, Selection
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.ros.runner import ros_context, running
@@ -106,6 +107,10 @@ class LivePage(Node):  # type: ignore[misc]
             robot.advance()
         if self._session.watched:
             self._session.store(self._snapshot())
+
+    def is_ready(self, one: Member) -> bool:
+        """Return whether a robot and its controller are there."""
+        return one.namespace in self.robots and self.robots[one.namespace].ready
 
     def stop(self) -> None:
         """Stop what pages drive by hand."""
@@ -247,6 +252,7 @@ def drive_live(
     ready: Ready,
     nodes_created: Callable[[Sequence[str]], None],
     goal_ended: Callable[[GoalEnd], None] | None = None,
+    robots: int = 1,
 ) -> None:
     """Run robot, wheel bridge and controller in this process, with the page, until a signal comes.
 
@@ -265,6 +271,7 @@ def drive_live(
         ready: Likewise.
         nodes_created: Receives the fully qualified names of the nodes.
         goal_ended: Receives the end of each goal.
+        robots: How many robots there are, each with its bridge and its controller.
 
     Raises:
         UserError: A node cannot run with the parameters or ROS arguments given.
@@ -277,28 +284,35 @@ def drive_live(
         ready(server)
         runner = stack.enter_context(stage)
         context = runner.context
-        nodes = add_nodes(runner, parameters, robot_parameters)
-        nodes_created([node.get_fully_qualified_name() for node in nodes])
+        fleet, names = members(robots), list[str]()
+        for one in fleet:
+            of_robot = one.placed(robot_parameters)
+            nodes = add_nodes(runner, parameters, of_robot, namespace=one.namespace)
+            names += [node.get_fully_qualified_name() for node in nodes]
+        nodes_created(names)
         pacing = Pacing() if lockstep else None
         # The executor of nodes that others can reach leaves the topics to `work`.
         page = runner.add(
             lambda: LivePage(session, context, polled=not isolated, pacing=pacing, goal_ended=goal_ended)
         )
         stack.callback(page.stop)
-        discover = recorder_of(runner, recording)
-        waiting = [goals] if isinstance(goals, Path) or len(goals) else []
+        selection = Selection(pattern=PATTERN) if robots > 1 else None
+        discover = recorder_of(runner, recording, selection)
+        waiting = [*fleet] if isinstance(goals, Path) or len(goals) else []
         since: list[float] = []
 
         def work() -> bool:
             discover()
             page.work()
-            robot = next(iter(page.robots.values()), None)
             # Whoever opened the page wants to see the whole drive. What is sent at once after the page
             # has its publishers would not be recorded.
-            if waiting and session.watched and robot is not None and robot.ready:
+            if waiting and session.watched and all(map(page.is_ready, fleet)):
                 since.append(runner.seconds())
                 if recording is None or since[-1] - since[0] >= RECORDED_AFTER:
-                    robot.send(waiting.pop(), relative=relative)
+                    for one in waiting:
+                        moved = one.moved(goals, relative=relative)
+                        page.robots[one.namespace].send(moved, relative=relative)
+                    waiting.clear()
             return signals.count > 0
 
         if pacing is None:

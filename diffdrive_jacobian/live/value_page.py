@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -12,9 +13,10 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.drives.read_values import as_read
-from diffdrive_jacobian.drives.values import NODES, START, World, record
+from diffdrive_jacobian.drives.values import START, World, record
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.live.commands import RobotCommand
+from diffdrive_jacobian.live.fleet import members
 from diffdrive_jacobian.live.pacing import Pacing, control_time
 from diffdrive_jacobian.live.robot_state import GoalEnd
 from diffdrive_jacobian.live.server import LiveServer, Ready
@@ -29,9 +31,7 @@ from diffdrive_jacobian.time_units import NANOSECONDS, seconds
 
 PERIOD = 1.0 / 30.0
 """Time between two states that are stored (s)."""
-NAME = '/'
-"""Namespace of the robot."""
-ROLES = {'robot': '/virtual_robot', 'controller': '/go_to_goal'}
+ROLES = {'robot': 'virtual_robot', 'controller': 'go_to_goal'}
 
 
 class ValueRobot(SteeredRobot):
@@ -39,7 +39,7 @@ class ValueRobot(SteeredRobot):
 
     def __init__(self, session: Session, world: World) -> None:
         """Follow what is published in the world."""
-        super().__init__(session, NAME, lambda: world.seconds)
+        super().__init__(session, world.namespace, lambda: world.seconds)
         self._world = world
         self._take_parameters()
         world.observers.append(self.observe)
@@ -132,57 +132,80 @@ class ValueRobot(SteeredRobot):
             failed('no goal is active')
 
     def _take_parameters(self) -> None:
-        parameters = self._world.parameters
-        self.state.robot_values = parameters[ROLES['robot']]
-        self.state.controller_values = parameters[ROLES['controller']]
+        world = self._world
+        self.state.robot_values = world.robot.parameters.by_name()
+        self.state.controller_values = world.driver.parameters.by_name()
 
 
 class ValuePage:
-    """What is behind the page: it obeys, and stores the state."""
+    """What is behind the page: it obeys, advances worlds, and stores the state."""
 
-    def __init__(self, session: Session, world: World, pacing: Pacing, *, controlled: bool) -> None:
-        """Show the robot of a world. `controlled`: whether the page controls its time."""
-        self._session, self._world, self._pacing = session, world, pacing
+    def __init__(
+        self, session: Session, worlds: Sequence[World], pacing: Pacing, *, controlled: bool
+    ) -> None:
+        """Show the robots of worlds. `controlled`: whether the page controls their time."""
+        self._session, self._worlds, self._pacing = session, worlds, pacing
         self._controlled = controlled
-        self.robot = ValueRobot(session, world)
+        self.robots = {world.namespace: ValueRobot(session, world) for world in worlds}
+        """The robots by namespace."""
         self._stored = -1.0
+
+    @property
+    def seconds(self) -> float:
+        """Time since the start (s)."""
+        return min(world.seconds for world in self._worlds)
+
+    def advance(self) -> None:
+        """Advance the world that is behind to its next event."""
+        min(self._worlds, key=lambda world: world.now).advance()
 
     def work(self) -> None:
         """Obey the page, and store the state as often as needed; to be called often."""
-        robot, session = self.robot, self._session
+        session = self._session
         for page, command in session.take_commands():
             if not isinstance(command, RobotCommand):
                 control_time(session, self._pacing if self._controlled else None, command)
-            elif command.robot != NAME:
+            elif command.robot not in self.robots:
                 session.notify('there is no such robot', 'warning')
             else:
-                robot.obey(page, command)
+                self.robots[command.robot].obey(page, command)
                 # The next command finds what this one did.
-                self._world.settle()
-        robot.drive()
-        self._world.settle()
+                self.settle()
+        for robot in self.robots.values():
+            robot.drive()
+        self.settle()
         now = time.monotonic()
         if session.watched and now - self._stored >= 0.9 * PERIOD:
             self._stored = now
-            robot.forget()
             session.store(self._snapshot())
 
+    def settle(self) -> None:
+        """Let everybody receive what was published."""
+        for world in self._worlds:
+            world.settle()
+
     def _snapshot(self) -> Snapshot:
-        robot = self.robot
-        shown = robot.shown()
+        for robot in self.robots.values():
+            robot.forget()
+        shown = (robot.shown() for robot in self.robots.values())
         return Snapshot(
-            robots=[] if shown is None else [shown],
-            trails={NAME: robot.state.trail},
-            true_trails={NAME: robot.state.true_trail},
+            robots=[one for one in shown if one is not None],
+            trails={name: robot.state.trail for name, robot in self.robots.items()},
+            true_trails={name: robot.state.true_trail for name, robot in self.robots.items()},
             world=self._pacing.shown() if self._controlled else {'kind': 'robots'},
-            fixed={'settings': {NAME: robot.settings()}, 'notes': []},
+            fixed={
+                'settings': {name: robot.settings() for name, robot in self.robots.items()},
+                'notes': [],
+            },
         )
 
     def stop(self) -> None:
-        """Stop what a page drives, and the goal."""
-        self.robot.stop()
-        self._world.driver.cancel(self._world.now)
-        self._world.settle()
+        """Stop what pages drive, and the goals."""
+        for robot in self.robots.values():
+            robot.stop()
+        for world in self._worlds:
+            world.driver.cancel(world.now)
+        self.settle()
 
 
 def drive_live(
@@ -200,6 +223,7 @@ def drive_live(
     ready: Ready,
     nodes_created: Callable[[Sequence[str]], None],
     goal_ended: Callable[[GoalEnd], None] | None = None,
+    robots: int = 1,
 ) -> None:
     """Drive robot, bridge and controller without ROS, with the page, until a signal comes.
 
@@ -212,25 +236,40 @@ def drive_live(
     if not isolated:
         raise UserError('other processes need rclpy, which is not installed')
     start = START if lockstep else time.time_ns()
-    world = World(parameters, robot_parameters, ros_arguments, start)
-    nodes_created(NODES)
-    session, pacing = Session(), Pacing()
+    fleet = members(robots)
+    worlds = [
+        World(
+            parameters,
+            one.placed(robot_parameters),
+            ros_arguments,
+            start,
+            namespace=one.namespace,
+        )
+        for one in fleet
+    ]
+    nodes_created([name for world in worlds for name in world.nodes.values()])
+    session, pacing, numbers = Session(), Pacing(), itertools.count(1)
     if recording is not None:
-        record(world, recording)
-    page = ValuePage(session, world, pacing, controlled=lockstep)
-    page.robot.on_end = goal_ended
-    waiting = [goals] if isinstance(goals, Path) or len(goals) else []
+        for world in worlds:
+            record(world, recording, numbers)
+    page = ValuePage(session, worlds, pacing, controlled=lockstep)
+    for robot in page.robots.values():
+        robot.on_end = goal_ended
+    waiting = [*fleet] if isinstance(goals, Path) or len(goals) else []
     with closing(LiveServer(session, port)) as server:
         ready(server)
 
         def work() -> bool:
             page.work()
             # Whoever opened the page wants to see the whole drive.
-            if waiting and session.watched and page.robot.ready:
-                page.robot.send(waiting.pop(), relative=relative)
-                world.settle()
+            if waiting and session.watched and all(robot.ready for robot in page.robots.values()):
+                for one in waiting:
+                    moved = one.moved(goals, relative=relative)
+                    page.robots[one.namespace].send(moved, relative=relative)
+                waiting.clear()
+                page.settle()
             return signals.count > 0
 
-        while not (work() or pacing.pace(world.seconds, work)):
-            world.advance()
+        while not (work() or pacing.pace(page.seconds, work)):
+            page.advance()
         page.stop()

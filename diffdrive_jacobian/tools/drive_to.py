@@ -110,6 +110,8 @@ def _check(parser: _cli.Parser, options: argparse.Namespace) -> None:
     if options.lockstep and options.open:
         parser.error('--lockstep and --open exclude each other: other processes have another clock')
     if not options.live:
+        if options.robots is not None:
+            parser.error('--robots is an option of --live')
         if not options.coordinates and options.path is None:
             parser.error(
                 'the following arguments are required: X Y or --path (only --live needs no goal)'
@@ -147,6 +149,7 @@ def _drive_with_page(goals: Goals, options: argparse.Namespace, how: dict[str, A
             ),
             nodes_created=lambda names: _cli.warn_of_unused_files(PROGRAM, how['ros_arguments'], names),
             goal_ended=_print_goal_end,
+            robots=options.robots or 1,
             **how,
         )
     return DONE
@@ -367,6 +370,12 @@ def _parser() -> _cli.Parser:
         action='store_true',
         help='show the drive on a page in the browser and steer the robot there, until Ctrl-C; without '
         'X Y the robot waits for goals; the bag is recorded, no picture is drawn',
+    )
+    parser.add_value(
+        '--robots',
+        'N',
+        'with --live: this many robots side by side, 1 to 16 (default: 1)',
+        kind=_cli.integer_from(1, 16),
     )
     parser.add_page()
     return parser

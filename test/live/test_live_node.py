@@ -116,7 +116,7 @@ class LiveValues(Live):
         self.world = World({**QUICK, **parameters}, {}, (), START)
         self.session = Session()
         self.page = self.session.enter()
-        self.node = ValuePage(self.session, self.world, Pacing(), controlled=False)
+        self.node = ValuePage(self.session, [self.world], Pacing(), controlled=False)
 
     @property
     def elapsed(self):
@@ -138,7 +138,7 @@ class LiveValues(Live):
 
     def ends(self):
         found = []
-        self.node.robot.on_end = found.append
+        self.node.robots['/'].on_end = found.append
         return found
 
 
