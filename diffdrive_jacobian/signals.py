@@ -159,3 +159,35 @@ def one_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def counting_interrupts() -> Iterator[Signals]:
+    """Count SIGINTs, and raise KeyboardInterrupt at the end if there was one.
+
+    A second request does so at once. An exception in the middle of a callback would be lost, or leave
+    the robot driving. Another handler than Python's own remains, and so does that of a thread.
+    """
+    signals = Signals()
+    before = signal.getsignal(signal.SIGINT)
+    main = threading.current_thread() is threading.main_thread()
+    if not main or before is not signal.default_int_handler:
+        yield signals
+        return
+    first = math.inf
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal first
+        now = time.monotonic()
+        if now - first >= TOGETHER:
+            raise KeyboardInterrupt
+        first = min(first, now)
+        signals.count += 1
+
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield signals
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if signals.count:
+        raise KeyboardInterrupt

@@ -24,7 +24,7 @@ from diffdrive_jacobian.parameters.arguments import unknown
 from diffdrive_jacobian.parameters.declaration import NodeParameters
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
-from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.signals import Signals, counting_interrupts
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.recording.recording import Recording
@@ -85,7 +85,8 @@ def drive(
             the caller finishes.
         ros_arguments: ROS arguments of all nodes, such as `['--ros-args', '-p', 'kp:=4.0']`. Without
             rclpy, parameters and files of parameters.
-        signals: Counter of the signals that end the drive. None: no signal does.
+        signals: Counter of the signals that end the drive. None: Ctrl-C ends it, and raises
+            KeyboardInterrupt when the robot stands and the bag is written.
         progress: Receives the progress. None: nothing does.
 
     Raises:
@@ -117,6 +118,8 @@ def drive(
     if path_controller is not None and not (isinstance(to, Path) or of_controller.get('pass_waypoints')):
         raise ValueError('path_controller has no effect on goals without pass_waypoints')
     with ExitStack() as stack:
+        if signals is None:
+            signals = stack.enter_context(counting_interrupts())
         bag = None
         if isinstance(recording, (str, FilePath)):
             # Slow to import.
@@ -133,7 +136,7 @@ def drive(
             robot_parameters=of_robot,
             recording=recording,
             keep=keep and recording is None and runner is None,
-            signals=signals or Signals(),
+            signals=signals,
             progress=progress,
         )
         if runner is not None or has_ros():
@@ -221,7 +224,8 @@ def as_goals(goals: ArrayLike | Path | str | FilePath) -> NDArray[np.float64] | 
             f'{short(goals, repr)}'
         ) from error
     if poses.ndim != 2 or poses.shape[1] not in (2, 3) or not len(poses):
-        raise ValueError(f'goals must have shape (n, 2) or (n, 3) with n > 0, got {poses.shape}')
+        meant = f': is it [{short(goals, repr)}]?' if poses.shape in ((2,), (3,)) else ''
+        raise ValueError(f'goals must have shape (n, 2) or (n, 3) with n > 0, got {poses.shape}{meant}')
     if len(poses) > MAX_WAYPOINTS:
         raise ValueError(f'goals must be at most {MAX_WAYPOINTS}, got {len(poses)}')
     if not np.all(np.abs(poses) <= MAX_POSITION):

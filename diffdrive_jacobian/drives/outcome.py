@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -128,6 +129,8 @@ class Outcome:
         if self.pose is not None:
             x, y, theta = self.pose
             where = f'at x {x:.3f}, y {y:.3f}, theta {theta:.3f}'
+        if not math.isnan(self.true_distance):
+            where += f', truly {self.true_distance:.2f} m from the goal'
         return f'Outcome({end} {where}, after {self.seconds:.1f} s)'
 
     def _repr_html_(self) -> str:

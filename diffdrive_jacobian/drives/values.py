@@ -169,7 +169,7 @@ class World:
             defaults = GoToGoalParameters().with_laws(**laws)
             of_driver = defaults.at_start({**given['go_to_goal'], **parameters})
         except ParameterError as error:
-            raise UserError(str(error)) from error
+            raise UserError(str(error)) from None
         parts = of_robot, of_bridge, of_driver
         check_names(ros_arguments, {name for node in parts for name in node.declared()})
         for node in parts:

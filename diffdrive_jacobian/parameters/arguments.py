@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
@@ -10,6 +9,9 @@ from typing import Any
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.file import concerns, sections
 from diffdrive_jacobian.text import printable
+
+SHORT = 3
+"""Length of names of parameters that are close to each other if half of the letters agree."""
 
 
 def given_parameters(arguments: Sequence[str], nodes: Collection[str]) -> dict[str, dict[str, Any]]:
@@ -48,9 +50,26 @@ def check_names(arguments: Sequence[str], known: Collection[str]) -> None:
 def unknown(names: Iterable[str], known: Collection[str]) -> Iterator[str]:
     """Yield `parameter 'NAME'`, with what was probably meant, for each name that is not known."""
     for name in sorted({*names} - {*known}):
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean '{close[0]}'?" if close else ''
+        close = ' or '.join(f"'{one}'" for one in resembling(name, known))
+        hint = f'; did you mean {close}?' if close else ''
         yield f"parameter '{printable(name)}'{hint}"
+
+
+def resembling(name: str, known: Collection[str]) -> list[str]:
+    """Return the known names that were probably meant, in alphabetical order.
+
+    They differ by upper case, by a few letters, or are the last part of a name with dots.
+    """
+    # Slow to import.
+    import difflib
+
+    names = sorted(known)
+    close = [one for one in names if one.lower() == name.lower()]
+    close = close or [one for one in names if one.endswith(f'.{name}')][:3]
+    close = close or difflib.get_close_matches(name, names, n=1)
+    if not close and len(name) <= SHORT:
+        close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+    return sorted(close)
 
 
 def _rules(arguments: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -14,6 +14,7 @@ from diffdrive_jacobian import lazy
 if TYPE_CHECKING:
     from diffdrive_jacobian.plots.arm_pictures import arm_ellipses, damping, legs, null_space, spring
     from diffdrive_jacobian.plots.calibration_pictures import calibration_figure
+    from diffdrive_jacobian.plots.film import Film
     from diffdrive_jacobian.plots.motion_pictures import lie_bracket, parking, path_laws
     from diffdrive_jacobian.plots.robot_pictures import (
         figure_1,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     'PICTURES',
+    'Film',
     'arm_at',
     'arm_ellipses',
     'calibration_figure',

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tempfile
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from diffdrive_jacobian.bags.timeline import Array, Timeline, seconds, timeline
+from diffdrive_jacobian.bags.timeline import Array, Timeline, jumps, seconds, timeline
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.numerics.checks import number, positive
 from diffdrive_jacobian.plots import run_panels, sketch
@@ -26,7 +27,11 @@ MOST_FRAMES = 3000
 """Largest number of frames: a film of two and a half minutes."""
 DPI = 90
 """Resolution (dots per inch)."""
+HOLD = 1.5
+"""How long the last frame stays: a GIF begins again at once (s)."""
 INLINE_DPI = 65
+LONGEST_FRAME = 0.1
+"""Longest duration of a frame in a notebook, unless a speed was given (s)."""
 INLINE_FRAMES = 100
 """Largest number of frames of a film in a notebook, each of which is a picture in it."""
 LATER = 0.2
@@ -43,7 +48,7 @@ class Film:
     """A film of runs. A notebook shows it.
 
     Attributes:
-        frames: Its number of frames.
+        frames: Its number of frames, of which the last ones are the same for `HOLD`.
         seconds: Its duration (s).
     """
 
@@ -58,9 +63,10 @@ class Film:
             ValueError: The speed is not positive, or so small that there are more than `MOST_FRAMES`.
             BagError, ModuleNotFoundError: As for `run_figure`.
         """
+        given = speed is not None
         if speed is not None:
             number('speed', speed, positive)
-        runs = as_runs(runs)
+        shown, runs = runs, as_runs(runs)
         self._timelines = [timeline(run) for run in runs]
         self._zeros = [run_panels.zero(one) for one in self._timelines]
         self._times = [
@@ -74,9 +80,11 @@ class Film:
         if speed < least:
             raise ValueError(f'speed must be at least {least:.3g} for such a long run, got {speed:g}')
         self.seconds = (last - first) / speed
-        self.frames = int(self.seconds * RATE) + 2
-        self._shown = np.linspace(first, last, self.frames)
-        self._figure = run_figure(runs)
+        moving = int(self.seconds * RATE) + 2
+        self._shown = np.append(np.linspace(first, last, moving), np.full(int(HOLD * RATE), last))
+        self.frames = len(self._shown)
+        self._longest = math.inf if given else LONGEST_FRAME
+        self._figure = run_figure(shown)
         self._robots = self._draw()
 
     def save(self, path: str | Path, *, progress: Callable[[int, int], object] | None = None) -> None:
@@ -115,7 +123,11 @@ class Film:
         import matplotlib
 
         # Ten megabytes.
-        smaller: Any = {'savefig.dpi': INLINE_DPI, 'animation.embed_limit': 50.0}
+        smaller: Any = {
+            'savefig.dpi': INLINE_DPI,
+            'animation.embed_limit': 50.0,
+            'animation.frame_format': 'jpeg',
+        }
         with styled(), matplotlib.rc_context(smaller):
             page: str = self._animation(min(self.frames, INLINE_FRAMES)).to_jshtml()
         # Its buttons are icons that are loaded from elsewhere: these are letters.
@@ -126,7 +138,7 @@ class Film:
         from matplotlib.animation import FuncAnimation
 
         shown = self._shown[np.linspace(0, self.frames - 1, frames).astype(int)]
-        interval = 1e3 * self.seconds / frames
+        interval = 1e3 * min((self.seconds + HOLD) / frames, self._longest)
         return FuncAnimation(self._figure, self._show, shown, interval=interval, repeat=False)
 
     def _draw(self) -> list[Callable[[float], None]]:
@@ -169,7 +181,11 @@ def _robot(
         inches: Size of a meter in the plane.
     """
     run, found = one.run, size(one.run)
-    poses, truths = run.odometry.values[:, :3], run.ground_truth.values[:, :2]
+    poses, truths = run.odometry.values[:, :3], run.ground_truth.values[:, :2].copy()
+    # A robot that was placed elsewhere has not driven there.
+    places = poses[:, :2].copy()
+    places[one.breaks] = math.nan
+    truths[jumps(run.ground_truth)] = math.nan
     driven = plane.plot([], [], color=color, lw=2.6, zorder=3.5)[0]
     truth_times = np.maximum.accumulate(seconds(run, run.ground_truth)) - zero
     truly = plane.plot([], [], color=color, zorder=3.4, **TRUTH)[0]
@@ -186,7 +202,7 @@ def _robot(
 
     def move(time: float) -> None:
         count = max(int(np.searchsorted(times, time, side='right')), 1)
-        driven.set_data(*poses[:count, :2].T)
+        driven.set_data(*places[:count].T)
         if mark is not None:
             mark.set_data(*poses[count - 1 : count, :2].T)
         for outline, part in parts:

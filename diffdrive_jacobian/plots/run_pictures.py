@@ -47,7 +47,8 @@ def run_figure(runs: Any, violations: Sequence[ViolationMark] = ()) -> Figure:
     changes of its goals, its faults, and the uncertainty along its path, see `plots.uncertainty`.
 
     Args:
-        runs: A `Run` or several, or what has one, as the outcome of a drive. They must have odometry.
+        runs: A `Run` or several, or what has one, as the outcome of a drive; or these by the names that
+            the figure shows. They must have odometry.
         violations: Violated properties of a single run.
 
     Raises:
@@ -58,6 +59,7 @@ def run_figure(runs: Any, violations: Sequence[ViolationMark] = ()) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
+    labels = [str(name) for name in runs] if isinstance(runs, Mapping) else None
     runs = as_runs(runs)
     if not runs:
         raise ValueError('runs must have at least one run, got none')
@@ -90,7 +92,7 @@ def run_figure(runs: Any, violations: Sequence[ViolationMark] = ()) -> Figure:
                 panel.axvline(change, color=GREY, lw=0.9, ls=':', zorder=1)
         marks += run_panels.mark_faults(panels.values(), alone, violations)
     _finish(panels, timelines, limits)
-    labels = names_of([run.path for run in runs])
+    labels = labels or names_of([run.path for run in runs])
     header, entries = _header(labels, [summary(one) for one in timelines])
     samples = [
         Line2D([], [], color=color, ls=style, lw=1.8, label=entry)
@@ -102,12 +104,13 @@ def run_figure(runs: Any, violations: Sequence[ViolationMark] = ()) -> Figure:
 
 
 def as_runs(given: Any) -> list[Run]:
-    """Return runs of a `Run`, of what has one (`run`), or of several of them.
+    """Return runs of a `Run`, of what has one (`run`), or of several of them, also by name.
 
     Raises:
         ValueError: Something else was given.
     """
     several = [given] if isinstance(given, Run) or hasattr(given, 'run') else given
+    several = several.values() if isinstance(several, Mapping) else several
     if not isinstance(several, Iterable):
         raise ValueError(f'runs must be a Run or several, got {short(given, repr)}')
     found: list[Any] = [one if isinstance(one, Run) else getattr(one, 'run', None) for one in several]

@@ -17,6 +17,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.parameters.arguments import resembling
 from diffdrive_jacobian.parameters.declaration import (
     NodeParameters,
     Parameter,
@@ -28,9 +29,6 @@ from diffdrive_jacobian.ros.rclpy_internals import (
     declared_parameters,
     parameter_overrides,
 )
-
-SHORT = 3
-"""Length of names of parameters that are close to each other if half of the letters agree."""
 
 P = TypeVar('P', bound=NodeParameters)
 
@@ -159,23 +157,11 @@ def report_unknown(nodes: Sequence[Node], others: Iterable[Node] = ()) -> None:
     shared = set().union(*(_shared(node.context) for node in nodes))
     given = set().union(*(_given(node.context) for node in nodes))
     for name, node in sorted(unknown.items()):
-        close = _resembling(name, known)
+        close = resembling(name, known)
         if name in shared and (name in ours or not close):
             continue
-        meant = ' or '.join(f"'{one}'" for one in sorted(close))
+        meant = ' or '.join(f"'{one}'" for one in close)
         hint = f'did you mean {meant}?' if close else f'see {" or ".join(programs)}'
         if name in given and name not in names_of_gains():
             raise ParameterError(f"no node of this program has the parameter '{name}'; {hint}")
         node.get_logger().warning(f"unknown parameter '{name}' is ignored; {hint}")
-
-
-def _resembling(name: str, known: Sequence[str]) -> list[str]:
-    """Return the known names that were probably meant."""
-    # Slow to import.
-    import difflib
-
-    close = [one for one in known if one.lower() == name.lower()]
-    close = close or difflib.get_close_matches(name, known, n=1)
-    if not close and len(name) <= SHORT:
-        close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-    return close

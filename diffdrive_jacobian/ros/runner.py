@@ -200,7 +200,8 @@ class NodeRunner(ABC):
             rule, name, *_ = str(error).splitlines()
             raise UserError(f'{rule} {printable(name.strip())}') from error
         except (ParameterError, ParameterException, InvalidQosOverridesError) as error:
-            raise UserError(str(error)) from error
+            # What was given was wrong, and the message says it all.
+            raise UserError(str(error)) from None
         except RCLError as error:
             why = reason(error)
             if 'length should not exceed' in why:

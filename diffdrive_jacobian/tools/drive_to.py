@@ -120,13 +120,14 @@ def _check(parser: _cli.Parser, options: argparse.Namespace) -> None:
             parser.error('--port and --no-browser are options of --live')
     elif options.timeout != parser.get_default('timeout'):
         parser.error('--timeout has no effect with --live, which ends by Ctrl-C')
+    parser.refuse_with(options, '--no-plot', '--live')
 
 
 def _check_without_ros(options: argparse.Namespace) -> None:
     """Say that no nodes run, and refuse what needs them."""
     if options.open:
         raise UserError(f'--open needs ROS 2, there is no Python module rclpy: {how_to_get_ros()}')
-    _output.note(PROGRAM, 'ROS 2 is not available: driving without nodes, as they drive in lockstep')
+    _output.note(PROGRAM, 'ROS 2 is not available: the same robot drives by the same laws without nodes')
 
 
 def _drive_with_page(goals: Goals, options: argparse.Namespace, how: dict[str, Any]) -> int:

@@ -23,7 +23,7 @@ from diffdrive_jacobian.tools import watch_run
 QUICK = ('--ros-args', '-p', 'go_to_goal:kp:=8.0', '-p', 'go_to_goal:kv:=4.0')
 
 
-WITHOUT_ROS = 'drive_to: ROS 2 is not available: driving without nodes, as they drive in lockstep\n'
+WITHOUT_ROS = 'drive_to: ROS 2 is not available: the same robot drives by the same laws without nodes\n'
 
 
 def opened(url):

@@ -14,7 +14,7 @@ from support.runs import run_of
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.plots import sketch
-from diffdrive_jacobian.plots.film import INLINE_FRAMES, RATE, Film
+from diffdrive_jacobian.plots.film import HOLD, INLINE_FRAMES, RATE, Film
 from diffdrive_jacobian.plots.run_panels import zero
 
 pytestmark = pytest.mark.slow
@@ -60,18 +60,22 @@ def test_a_film_is_as_long_as_the_run_took_by_its_speed(recorded):
     took = float(np.ptp(timeline(recorded[0]).time))
     assert film.seconds == pytest.approx(took / 8.0, rel=0.02)
     picture = Image.open(io.BytesIO(film.content('gif', lambda *state: seen.append(state))))
-    assert picture.n_frames == film.frames == len(seen) == int(film.seconds * RATE) + 2
-    first = np.array(picture.convert('RGB'))
-    picture.seek(film.frames - 1)
-    assert (first != np.array(picture.convert('RGB'))).any()
+    held = int(HOLD * RATE)
+    assert film.frames == len(seen) == int(film.seconds * RATE) + 2 + held
+    # Frames that are the same become one, which stays longer.
+    assert picture.n_frames == film.frames - held
     assert picture.info['duration'] * RATE == 1000.0
+    first = np.array(picture.convert('RGB'))
+    picture.seek(picture.n_frames - 1)
+    assert (first != np.array(picture.convert('RGB'))).any()
+    assert picture.info['duration'] >= 1000.0 * HOLD
 
 
 def test_a_notebook_shows_a_film_of_bounded_size(recorded, monkeypatch):
     monkeypatch.setattr('diffdrive_jacobian.plots.film.INLINE_FRAMES', 3)
     assert INLINE_FRAMES >= 100
     page = Film(recorded[0])._repr_html_()
-    assert page.count('data:image/png;base64') == 3
+    assert page.count('data:image/jpeg;base64') == 3
     # It needs nothing from elsewhere.
     assert 'href=' not in page
     assert 'fa-play' not in page

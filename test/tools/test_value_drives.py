@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 from dataclasses import fields, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from diffdrive_jacobian.drives import drive, driving, nodes, values
 from diffdrive_jacobian.drives.driving import as_goals
 from diffdrive_jacobian.drives.outcome import Outcome, Request
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.signals import Signals
 
@@ -243,7 +245,12 @@ def test_an_outcome_shows_its_run():
     assert outcome.plot().axes
     assert 'data:image/svg+xml;base64,' in outcome._repr_html_()
     assert 'timed out at' in repr(outcome)
-    assert run_figure([outcome, outcome.run]).axes
+    for given, names in (
+        ([outcome, outcome.run], ['drive 1', 'drive 2']),
+        ({'first': outcome, 2: outcome}, ['first', '2']),
+    ):
+        (legend, *_) = run_figure(given).legends
+        assert [text.get_text().partition(':')[0] for text in legend.get_texts()] == names
     for wrong in (3, [3], 'run'):
         with pytest.raises(ValueError, match='runs must be a Run or several, got'):
             run_figure(wrong)
@@ -264,6 +271,30 @@ def test_a_law_of_the_caller_drives_with_its_gains(monkeypatch, ros):
         drive(TO, controller=SPIRAL, parameters={'boast': 0.7}, lockstep=True)
     with pytest.raises(ValueError, match="a name of its own, got 'pose'"):
         drive(TO, controller=replace(SPIRAL, name='pose'), lockstep=True)
+
+
+@pytest.mark.parametrize('ros', [True, False])
+def test_an_interrupt_ends_a_drive_and_its_bag_cleanly(monkeypatch, tmp_path, ros):
+    """As of the button Stop of a notebook. It is not lost in a callback."""
+    monkeypatch.setattr(driving, 'has_ros', lambda: ros)
+
+    class Progress:
+        def nodes_created(self, names):
+            pass
+
+        def driving(self, seconds, index, distance, wheels):
+            if not 1.0 <= seconds < 1.1 or interrupted:
+                return
+            interrupted.append(seconds)
+            signal.raise_signal(signal.SIGINT)
+
+    interrupted = []
+    with pytest.raises(KeyboardInterrupt):
+        drive('circle:5', lockstep=True, recording=tmp_path / 'run', progress=Progress())
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    run = read_run(tmp_path / 'run')
+    assert GoalState(int(run.goal_status.values[-1, 0])) is GoalState.CANCELED
+    assert not run.odometry.values[-1, 3:].any()
 
 
 def test_a_text_is_a_path(tmp_path):

@@ -154,7 +154,7 @@ def test_drive_to_drives_without_nodes_and_says_so(tmp_path):
         ('drive_to', 1, 1, '--open', '--no-record'),
     ]
     first, real, *others = without_ros(*calls, cwd=tmp_path)
-    said = 'drive_to: ROS 2 is not available: driving without nodes, as they drive in lockstep'
+    said = 'drive_to: ROS 2 is not available: the same robot drives by the same laws without nodes'
     assert (first.code, first.err.splitlines()[0]) == (0, said)
     assert first.out == run(*calls[0]).out
     assert real.code == 0
