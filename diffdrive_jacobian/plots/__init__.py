@@ -87,4 +87,4 @@ PICTURES = {name: what for name, (_, what) in _PICTURES.items()}
 if not TYPE_CHECKING:
     _FUNCTIONS = {name: f'plots.{module}' for name, (module, _) in _PICTURES.items()}
     _FIGURES = {f'{what}_figure': f'plots.{what}_pictures' for what in ('calibration', 'run', 'sweep')}
-    __getattr__, __dir__ = lazy.attach(__name__, _FUNCTIONS | _FIGURES)
+    __getattr__, __dir__ = lazy.attach(__name__, _FUNCTIONS | _FIGURES | {'Film': 'plots.film'})
