@@ -77,7 +77,7 @@ setup(
         'testing': ['hypothesis>=6', 'pytest>=7'],
         'doc': ['pdoc>=15'],
         'explore': ['hypothesis>=6'],
-        'live': ['websockets>=15'],
+        'live': ['segno>=1.5', 'websockets>=15'],
         'plot': ['matplotlib>=3.5'],
         'test': [
             'distributed',
@@ -86,6 +86,7 @@ setup(
             'pytest>=7',
             'pytest-xdist>=3',
             'pyyaml>=5',
+            'segno>=1.5',
             'websockets>=15',
         ],
     },

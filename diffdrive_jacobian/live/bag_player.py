@@ -20,7 +20,7 @@ from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Ste
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.robot_state import MAX_POINTS, TRUTH_LIFE, RobotState, Trail
 from diffdrive_jacobian.live.server import LiveServer, Ready
-from diffdrive_jacobian.live.session import Session, Snapshot
+from diffdrive_jacobian.live.session import Session, Share, Snapshot
 from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.names import base_name, namespace_of
@@ -41,7 +41,9 @@ MAX_ROBOTS = 16
 """Largest number of robots that are shown."""
 
 
-def watch_bag(path: Path, *, port: int, speed: float, signals: Signals, ready: Ready) -> None:
+def watch_bag(
+    path: Path, *, port: int, speed: float, signals: Signals, ready: Ready, share: Share | None = None
+) -> None:
     """Play a bag on the page.
 
     Args:
@@ -50,6 +52,7 @@ def watch_bag(path: Path, *, port: int, speed: float, signals: Signals, ready: R
         speed: Speed at the start.
         signals: Counter of the signals that end it.
         ready: Receives the server when it answers.
+        share: With whom the page is shared. None: with nobody.
 
     Raises:
         BagError: It is not a bag, is damaged, or has no odometry.
@@ -57,7 +60,7 @@ def watch_bag(path: Path, *, port: int, speed: float, signals: Signals, ready: R
     """
     session = Session()
     player = BagPlayer(session, path, read_robots(path), speed=speed)
-    with closing(LiveServer(session, port)) as server:
+    with closing(LiveServer(session, port, share)) as server:
         ready(server)
         while not signals.count:
             player.work()

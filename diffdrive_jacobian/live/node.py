@@ -24,7 +24,7 @@ from diffdrive_jacobian.live.live_robot import LiveRobot
 from diffdrive_jacobian.live.pacing import Pacing, control_time
 from diffdrive_jacobian.live.robot_state import GoalEnd
 from diffdrive_jacobian.live.server import LiveServer, Ready
-from diffdrive_jacobian.live.session import Session, Snapshot
+from diffdrive_jacobian.live.session import Session, Share, Snapshot
 from diffdrive_jacobian.lockstep.runner import LockstepRunner
 from diffdrive_jacobian.messages.codecs import PARAMETER_EVENT, Changes
 from diffdrive_jacobian.messages.names import base_name, full_name, is_named, namespace_of, node_of
@@ -210,7 +210,14 @@ class LivePage(Node):  # type: ignore[misc]
                     link.changed(changes.values)
 
 
-def watch_nodes(*, ros_arguments: Sequence[str], port: int, signals: Signals, ready: Ready) -> None:
+def watch_nodes(
+    *,
+    ros_arguments: Sequence[str],
+    port: int,
+    signals: Signals,
+    ready: Ready,
+    share: Share | None = None,
+) -> None:
     """Show and steer robots whose nodes run in other processes.
 
     Args:
@@ -218,13 +225,14 @@ def watch_nodes(*, ros_arguments: Sequence[str], port: int, signals: Signals, re
         port: TCP port of the page. 0: any free one.
         signals: Counter of the signals that end it.
         ready: Receives the server when it answers.
+        share: With whom the page is shared. None: with nobody.
 
     Raises:
         UserError: The ROS arguments are invalid.
         OSError: The port is in use.
     """
     session = Session()
-    with closing(LiveServer(session, port)) as server:
+    with closing(LiveServer(session, port, share)) as server:
         ready(server)
         with (
             ros_context(['watch_run', *ros_arguments]) as context,
@@ -253,6 +261,7 @@ def drive_live(
     nodes_created: Callable[[Sequence[str]], None],
     goal_ended: Callable[[GoalEnd], None] | None = None,
     robots: int = 1,
+    share: Share | None = None,
 ) -> None:
     """Run robot, wheel bridge and controller in this process, with the page, until a signal comes.
 
@@ -272,6 +281,7 @@ def drive_live(
         nodes_created: Receives the fully qualified names of the nodes.
         goal_ended: Receives the end of each goal.
         robots: How many robots there are, each with its bridge and its controller.
+        share: As for `watch_nodes`.
 
     Raises:
         UserError: A node cannot run with the parameters or ROS arguments given.
@@ -280,7 +290,7 @@ def drive_live(
     """
     session = Session()
     stage = in_lockstep(ros_arguments) if lockstep else in_real_time(ros_arguments, isolated=isolated)
-    with closing(LiveServer(session, port)) as server, ExitStack() as stack:
+    with closing(LiveServer(session, port, share)) as server, ExitStack() as stack:
         ready(server)
         runner = stack.enter_context(stage)
         context = runner.context

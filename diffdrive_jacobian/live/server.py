@@ -1,10 +1,15 @@
-"""The server of the page: HTTP and websockets on 127.0.0.1, in a thread of its own."""
+"""The server of the page: HTTP and websockets on 127.0.0.1, in a thread of its own.
+
+If it is shared, guests reach it by another address of this machine, with a token of their own. They see
+what the page shows, and steer only if that was given.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import hmac
+import io
 import json
 import logging
 import re
@@ -19,13 +24,13 @@ from http import HTTPStatus
 from importlib.resources import files
 from typing import Any, TypeAlias
 
-from websockets.asyncio.server import ServerConnection, serve
+from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from diffdrive_jacobian.live.commands import MAX_SIZE, CommandError, parse
-from diffdrive_jacobian.live.session import Page, Session
+from diffdrive_jacobian.live.session import Page, Session, Share
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
 
 TYPES = {
@@ -65,7 +70,8 @@ SOCKET = 'socket'
 """Name of the websocket below the token."""
 OPEN = 'open'
 """Name of the address that is opened in the browser once, before its ticket."""
-_HOST = re.compile(rf'({"|".join(map(re.escape, HOSTS))})(?::\d{{1,5}})?')
+SHARE = 'share.svg'
+"""Name of the QR code of a shared page."""
 
 
 class Refusal(Enum):
@@ -79,8 +85,9 @@ class Refusal(Enum):
 class Access:
     """The secrets of one server, and the check of its requests."""
 
-    def __init__(self) -> None:
-        """Choose the secrets."""
+    def __init__(self, hosts: Sequence[str] = HOSTS) -> None:
+        """Choose the secrets. `hosts` are the names by which the server may be reached."""
+        self._hosts = re.compile(rf'({"|".join(map(re.escape, hosts))})(?::\d{{1,5}})?')
         self.token = secrets.token_urlsafe(24)
         """First part of every path."""
         self.ticket = secrets.token_urlsafe(24)
@@ -94,7 +101,7 @@ class Access:
         Returns:
             `('page', NAME)` for a file, `('socket', '')`, `('redirect', PATH)`, or why it is refused.
         """
-        if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
+        if len(hosts) != 1 or not self._hosts.fullmatch(hosts[0]):
             return Refusal.HOST
         if len(origins) > 1 or any(origin != f'http://{hosts[0]}' for origin in origins):
             return Refusal.ORIGIN
@@ -122,8 +129,11 @@ def _same(given: str, secret: str) -> bool:
 ADDRESS = '127.0.0.1'
 PERIOD = 0.04
 """Time between two states that a page receives (s)."""
-MAX_PAGES = 8
-"""Largest number of pages at once."""
+GUEST_PERIOD = 0.1
+"""The same of a guest: there may be a room full of them (s)."""
+MAX_PAGES, MAX_GUESTS = 8, 64
+"""Largest number of pages at once, of this machine and of guests."""
+LOOK_ONLY = 'you may look, not steer: whoever shares this page has not given control'
 COMMAND_RATE, COMMAND_BURST = 100.0, 200.0
 """Commands of a page per second, and at once. A page that sends more is disconnected."""
 MAX_STRANGERS = 32
@@ -164,14 +174,23 @@ class _Connection(ServerConnection):
         super().connection_lost(exc)
 
 
+class _Door:
+    """One address at which the server listens, with its secrets and its guests."""
+
+    def __init__(self, listening: socket.socket, access: Access, most: int, period: float) -> None:
+        self.socket, self.access, self.most, self.period = listening, access, most, period
+        self.may_steer = True
+        self.strangers: dict[ServerConnection, asyncio.Transport] = {}
+
+
 class LiveServer:
     """Serves the page of a session, in a thread of its own, until it is closed."""
 
-    def __init__(self, session: Session, port: int = 0) -> None:
-        """Listen on a TCP port (0: any free one).
+    def __init__(self, session: Session, port: int = 0, share: Share | None = None) -> None:
+        """Listen on a TCP port (0: any free one), and if it is shared, at the same port of that address.
 
         Raises:
-            OSError: The port is in use, or may not be used.
+            OSError: The port is in use, or may not be used, or the address is none of this machine.
         """
         self._session = session
         self._files = page_files()
@@ -180,11 +199,32 @@ class LiveServer:
         self._socket = socket.create_server((ADDRESS, port))
         self.port: int = self._socket.getsockname()[1]
         """TCP port."""
-        self._strangers: dict[ServerConnection, asyncio.Transport] = {}
+        self._doors = [_Door(self._socket, self.access, MAX_PAGES, PERIOD)]
+        self.shared_url = ''
+        """Address of the page for guests. Empty: it is not shared."""
+        if share is not None:
+            self._open_to_guests(share)
         self._loop = asyncio.new_event_loop()
         self._closing = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name='live page', daemon=True)
         self._thread.start()
+
+    def _open_to_guests(self, share: Share) -> None:
+        version = socket.AF_INET6 if ':' in share.address else socket.AF_INET
+        host = f'[{share.address}]' if version == socket.AF_INET6 else share.address
+        try:
+            listening = socket.create_server((share.address, self.port), family=version)
+        except OSError:
+            self._socket.close()
+            raise
+        door = _Door(listening, Access([host]), MAX_GUESTS, GUEST_PERIOD)
+        # Nothing opens it in a browser.
+        door.access.ticket = ''
+        door.may_steer = share.control
+        self._doors.append(door)
+        self.shared_url = f'http://{host}:{self.port}/{door.access.token}/'
+        # It is for the page of this machine, but guests know it anyway.
+        self._files[SHARE] = TYPES['.svg'], qr_code(self.shared_url)
 
     @property
     def url(self) -> str:
@@ -218,14 +258,26 @@ class LiveServer:
         # Who cannot connect is told so. Nothing of that is for the terminal.
         logger.addHandler(logging.NullHandler())
         logger.propagate = False
+        servers = [await self._listen(door, logger) for door in self._doors]
+        await self._closing.wait()
+        for server in servers:
+            server.close()
+        for door in self._doors:
+            for transport in door.strangers.values():
+                transport.abort()
+        with contextlib.suppress(asyncio.TimeoutError):
+            waits = (server.wait_closed() for server in servers)
+            await asyncio.wait_for(asyncio.gather(*waits), 0.5)
+
+    async def _listen(self, door: _Door, logger: logging.Logger) -> Server:
         # Typed as a class, but any factory does.
-        factory: Any = partial(_Connection, strangers=self._strangers)
-        server = await serve(
-            self._handle,
-            sock=self._socket,
+        factory: Any = partial(_Connection, strangers=door.strangers)
+        server: Server = await serve(
+            partial(self._handle, door),
+            sock=door.socket,
             backlog=MAX_STRANGERS,
             create_connection=factory,
-            process_request=self._answer,
+            process_request=partial(self._answer, door),
             compression=None,
             max_size=MAX_SIZE,
             max_queue=8,
@@ -236,17 +288,12 @@ class LiveServer:
             server_header=None,
             logger=logger,
         )
-        await self._closing.wait()
-        server.close()
-        for transport in self._strangers.values():
-            transport.abort()
-        with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(server.wait_closed(), 0.5)
+        return server
 
-    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+    def _answer(self, door: _Door, connection: ServerConnection, request: Request) -> Response | None:
         """Return the answer to a request. None: it may open the websocket."""
         headers = request.headers
-        found = self.access.check(request.path, headers.get_all('Host'), headers.get_all('Origin'))
+        found = door.access.check(request.path, headers.get_all('Host'), headers.get_all('Origin'))
         if isinstance(found, Refusal):
             return _response(
                 HTTPStatus.FORBIDDEN, 'text/plain; charset=utf-8', f'{found.value}\n'.encode()
@@ -255,36 +302,42 @@ class LiveServer:
         if kind == 'redirect':
             return _response(HTTPStatus.SEE_OTHER, 'text/plain', b'', Location=name)
         if kind == 'socket':
-            self._strangers.pop(connection, None)
+            door.strangers.pop(connection, None)
             return None
         if name not in self._files:
             return _response(HTTPStatus.NOT_FOUND, 'text/plain', b'there is no such file\n')
         return _response(HTTPStatus.OK, *self._files[name])
 
-    async def _handle(self, connection: ServerConnection) -> None:
-        if len(connection.server.connections) > MAX_PAGES:
-            await connection.close(TRY_AGAIN_LATER, f'{MAX_PAGES} pages are open already')
+    async def _handle(self, door: _Door, connection: ServerConnection) -> None:
+        if len(connection.server.connections) > door.most:
+            await connection.close(TRY_AGAIN_LATER, f'{door.most} pages are open already')
             return
         page = self._session.enter()
-        sending = asyncio.ensure_future(self._send(connection, page))
+        sending = asyncio.ensure_future(self._send(door, connection, page))
         try:
             with contextlib.suppress(ConnectionClosed):
-                await self._receive(connection, page)
+                await self._receive(door, connection, page)
         finally:
             # First, because driving by hand ends with it.
             self._session.leave(page)
             sending.cancel()
 
-    async def _send(self, connection: ServerConnection, page: Page) -> None:
+    async def _send(self, door: _Door, connection: ServerConnection, page: Page) -> None:
+        shared = self.shared_url if door is self._doors[0] else ''
+        given = self._doors[-1].may_steer
+        may: dict[str, Any] = {'steer': door.may_steer, 'shared': shared, 'guests_steer': given}
         with contextlib.suppress(ConnectionClosed):
             while True:
                 frame = page.frame(self._session)
                 if frame is not None:
+                    if may:
+                        # Once.
+                        frame, may = {**frame, 'may': may}, {}
                     # Waits while the page does not read; then the latest state is sent.
                     await connection.send(json.dumps(frame, allow_nan=False, separators=(',', ':')))
-                await asyncio.sleep(PERIOD)
+                await asyncio.sleep(door.period)
 
-    async def _receive(self, connection: ServerConnection, page: Page) -> None:
+    async def _receive(self, door: _Door, connection: ServerConnection, page: Page) -> None:
         limit = TokenBucket(COMMAND_BURST, 1.0 / COMMAND_RATE)
         invalid = 0
         async for text in connection:
@@ -292,6 +345,10 @@ class LiveServer:
                 await connection.close(
                     POLICY_VIOLATION, f'more than {COMMAND_RATE:g} commands per second'
                 )
+                return
+            if not door.may_steer:
+                # The page of a guest has nothing to send them by: it is another program.
+                await connection.close(POLICY_VIOLATION, LOOK_ONLY)
                 return
             try:
                 command = parse(text)
@@ -304,6 +361,20 @@ class LiveServer:
                 continue
             if not self._session.put(page, command):
                 self._session.notify('too many commands are waiting: this one was dropped', 'warning')
+
+
+def qr_code(text: str) -> bytes:
+    """Return a QR code as SVG, of the size that the page gives it.
+
+    Raises:
+        ModuleNotFoundError: segno is not installed.
+    """
+    import segno
+
+    content = io.BytesIO()
+    code = segno.make(text, micro=False)
+    code.save(content, kind='svg', omitsize=True, border=2, dark='#000', light='#fff')
+    return content.getvalue()
 
 
 Ready: TypeAlias = Callable[[LiveServer], None]

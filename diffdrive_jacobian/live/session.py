@@ -23,6 +23,16 @@ MAX_NOTICES = 50
 Level = Literal['info', 'warning', 'error']
 
 
+@dataclass(frozen=True, slots=True)
+class Share:
+    """Whom a page is shared with."""
+
+    address: str
+    """Address of this machine by which guests reach it."""
+    control: bool = False
+    """Whether they may steer."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Snapshot:
     """State of all robots at one time. Nothing in it is changed later."""

@@ -20,7 +20,7 @@ from diffdrive_jacobian.live.fleet import members
 from diffdrive_jacobian.live.pacing import Pacing, control_time
 from diffdrive_jacobian.live.robot_state import GoalEnd
 from diffdrive_jacobian.live.server import LiveServer, Ready
-from diffdrive_jacobian.live.session import Session, Snapshot
+from diffdrive_jacobian.live.session import Session, Share, Snapshot
 from diffdrive_jacobian.live.steered_robot import COMMAND_LIFE, SteeredRobot
 from diffdrive_jacobian.messages.codecs import Command, Place, Route
 from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
@@ -224,6 +224,7 @@ def drive_live(
     nodes_created: Callable[[Sequence[str]], None],
     goal_ended: Callable[[GoalEnd], None] | None = None,
     robots: int = 1,
+    share: Share | None = None,
 ) -> None:
     """Drive robot, bridge and controller without ROS, with the page, until a signal comes.
 
@@ -256,7 +257,7 @@ def drive_live(
     for robot in page.robots.values():
         robot.on_end = goal_ended
     waiting = [*fleet] if isinstance(goals, Path) or len(goals) else []
-    with closing(LiveServer(session, port)) as server:
+    with closing(LiveServer(session, port, share)) as server:
         ready(server)
 
         def work() -> bool:

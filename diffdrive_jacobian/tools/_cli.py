@@ -19,10 +19,12 @@ from diffdrive_jacobian.numerics import checks
 from diffdrive_jacobian.numerics.checks import Check, between, finite, integer, one_of
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError
 from diffdrive_jacobian.parameters.file import configurations
+from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.tools._output import note
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.control import Path as PlannedPath
+    from diffdrive_jacobian.live.session import Share
 
 T = TypeVar('T')
 
@@ -443,6 +445,26 @@ class Parser(argparse.ArgumentParser):
         self.add_argument(
             '--no-browser', action='store_true', help='only print the address, do not open a browser'
         )
+        self.add_value(
+            '--share',
+            'ADDRESS',
+            'let others look at the page by this address of this machine, such as 192.168.1.7, with a '
+            'link and a QR code of their own (default: nobody)',
+            kind=_address,
+        )
+        self.add_argument(
+            '--share-control', action='store_true', help='with --share: let them steer, too'
+        )
+
+    def given_share(self, options: argparse.Namespace) -> Share | None:
+        """Return with whom the page is shared; None: with nobody."""
+        self.refuse_without(options, '--share-control', '--share')
+        if options.share is None:
+            return None
+        # Slow to import.
+        from diffdrive_jacobian.live.session import Share
+
+        return Share(options.share, options.share_control)
 
 
 def _is_given(options: argparse.Namespace, option: str) -> bool:
@@ -452,6 +474,23 @@ def _is_given(options: argparse.Namespace, option: str) -> bool:
 
 
 # --- What was given
+
+
+def _address(text: str) -> str:
+    """Return the address of one interface of a machine."""
+    # Slow to import.
+    import ipaddress
+
+    try:
+        address = ipaddress.ip_address(text)
+    except ValueError:
+        address = None
+    if address is None or address.is_unspecified or address.is_loopback or address.is_multicast:
+        raise argparse.ArgumentTypeError(
+            'must be the address by which others reach this machine, such as 192.168.1.7, got '
+            f'{printable(text)}'
+        )
+    return str(address)
 
 
 def is_relative(path: str) -> bool:

@@ -42,6 +42,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     _check(parser, options)
     heading = parser.given_heading(options)
     path = None if options.path is None else parser.given_path(options)
+    share = parser.given_share(options)
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
@@ -79,7 +80,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     with saved_on_error(recording):
         try:
             if options.live:
-                code = _drive_with_page(goals, options, how)
+                code = _drive_with_page(goals, options, {**how, 'share': share})
             else:
                 with closing(_Progress(goals, options, ros)) as progress:
                     outcome = drive(goals, timeout=options.timeout, progress=progress, keep=False, **how)
@@ -110,8 +111,8 @@ def _check(parser: _cli.Parser, options: argparse.Namespace) -> None:
     if options.lockstep and options.open:
         parser.error('--lockstep and --open exclude each other: other processes have another clock')
     if not options.live:
-        if options.robots is not None:
-            parser.error('--robots is an option of --live')
+        for option in ('--robots', '--share'):
+            parser.refuse_without(options, option, '--live')
         if not options.coordinates and options.path is None:
             parser.error(
                 'the following arguments are required: X Y or --path (only --live needs no goal)'
@@ -133,7 +134,7 @@ def _check_without_ros(options: argparse.Namespace) -> None:
 def _drive_with_page(goals: Goals, options: argparse.Namespace, how: dict[str, Any]) -> int:
     """Drive with the page until Ctrl-C; return the exit code. `how`: arguments of `drive`."""
     given = len(options.coordinates) > 0 or options.path is not None
-    with watch_run.explaining_page_errors(options.port):
+    with watch_run.explaining_page_errors(options):
         from diffdrive_jacobian.drives.driving import has_ros
 
         if has_ros():

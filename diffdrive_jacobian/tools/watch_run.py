@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import errno
 import os
+import sys
 import threading
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
 
 from diffdrive_jacobian.errors import NotDoneError, UserError
 from diffdrive_jacobian.numerics.checks import between
@@ -20,6 +21,7 @@ from diffdrive_jacobian.tools.entry_points import DONE, long_lived
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.live.server import LiveServer
+    from diffdrive_jacobian.live.session import Share
 
 PROGRAM = 'watch_run'
 DISPLAYS = ('DISPLAY', 'WAYLAND_DISPLAY')
@@ -37,25 +39,28 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         parser.error('--rate needs a BAG: running robots have their own time')
     if options.bag is not None and options.ros:
         parser.error('a BAG needs no ROS arguments')
-    with explaining_page_errors(options.port):
-        (_watch_nodes if options.bag is None else _play)(options, signals)
+    share = parser.given_share(options)
+    with explaining_page_errors(options):
+        (_watch_nodes if options.bag is None else _play)(options, signals, share)
     return DONE
 
 
-def _play(options: argparse.Namespace, signals: Signals) -> None:
+def _play(options: argparse.Namespace, signals: Signals, share: Share | None) -> None:
     from diffdrive_jacobian.live.bag_player import watch_bag
 
     print(f'reading {printable(options.bag, PATH_LIMIT)}', flush=True)
     ready, speed = announcing(options, notice=PLAYS), options.rate or 1.0
-    watch_bag(options.bag, port=options.port, speed=speed, signals=signals, ready=ready)
+    page: dict[str, Any] = {'port': options.port, 'signals': signals, 'ready': ready, 'share': share}
+    watch_bag(options.bag, speed=speed, **page)
 
 
-def _watch_nodes(options: argparse.Namespace, signals: Signals) -> None:
+def _watch_nodes(options: argparse.Namespace, signals: Signals, share: Share | None) -> None:
     with long_lived(), signals.ending_at_once():
         from diffdrive_jacobian.live.node import watch_nodes
 
     ready = announcing(options)
-    watch_nodes(ros_arguments=options.ros, port=options.port, signals=signals, ready=ready)
+    page: dict[str, Any] = {'port': options.port, 'signals': signals, 'ready': ready, 'share': share}
+    watch_nodes(ros_arguments=options.ros, **page)
 
 
 # --- The page of a tool
@@ -77,6 +82,8 @@ def announcing(
         if waiting:
             print(f'{waiting} when the page is open')
         print(notice, flush=True)
+        if server.shared_url:
+            _announce_guests(server, control=options.share_control)
         if not options.no_browser and any(map(os.environ.get, DISPLAYS)):
             # Starting a browser may take seconds.
             arguments = (server.opening_url,)
@@ -85,22 +92,40 @@ def announcing(
     return announce
 
 
+def _announce_guests(server: LiveServer, *, control: bool) -> None:
+    """Print the address for guests, also as a code that phones read."""
+    import segno
+
+    print(f'guests: {server.shared_url}')
+    may = 'can STEER the robots' if control else 'can look'
+    print(f'whoever knows that address {may}; what is sent is not encrypted', flush=True)
+    if sys.stdout.isatty():
+        segno.make(server.shared_url, micro=False).terminal(compact=True)
+
+
 class PageError(UserError, NotDoneError):
     """The page cannot be served; nothing ran."""
 
 
 @contextmanager
-def explaining_page_errors(port: int) -> Iterator[None]:
-    """Raise PageError where the given port cannot be used, or the module of the server is missing."""
+def explaining_page_errors(options: argparse.Namespace) -> Iterator[None]:
+    """Raise PageError where the port or the address cannot be used, or a module is missing."""
     try:
         yield
     except ModuleNotFoundError as error:
-        if (error.name or '').split('.')[0] != 'websockets':
+        module = (error.name or '').split('.')[0]
+        if module not in ('websockets', 'segno'):
             raise
         raise PageError(
-            "the page needs the Python module websockets: pip install 'diffdrive_jacobian[live]'"
+            f"the page needs the Python module {module}: pip install 'diffdrive_jacobian[live]'"
         ) from error
     except OSError as error:
+        port = options.port
+        if error.errno == errno.EADDRNOTAVAIL and options.share is not None:
+            raise PageError(
+                f'--share {options.share} is no address of this machine, which has '
+                f'{", ".join(_addresses()) or "none"}'
+            ) from error
         why = {
             errno.EADDRINUSE: 'is in use: choose another one, or none for any free one',
             errno.EACCES: 'may not be used: choose one above 1023',
@@ -108,6 +133,22 @@ def explaining_page_errors(port: int) -> Iterator[None]:
         if why is None or not port:
             raise
         raise PageError(f'--port {port} {why}') from error
+
+
+def _addresses() -> list[str]:
+    """Return addresses of this machine by which others may reach it, as far as they are known."""
+    # Slow to import.
+    import ipaddress
+    import socket
+
+    found = set()
+    with suppress(OSError):
+        found = {str(one[4][0]) for one in socket.getaddrinfo(socket.gethostname(), None)}
+    # The one by which it would reach others; nothing is sent.
+    with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(('192.0.2.1', 9))
+        found.add(str(probe.getsockname()[0]))
+    return sorted(one for one in found if not ipaddress.ip_address(one.partition('%')[0]).is_loopback)
 
 
 def _rate(text: str) -> float:

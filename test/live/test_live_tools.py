@@ -140,7 +140,7 @@ def test_drive_to_live_in_real_time(run_with_page):
 
 
 def test_without_a_display_the_address_is_printed_and_no_browser_started(monkeypatch, capsys):
-    server = SimpleNamespace(url='http://127.0.0.1:1/secret/', opening_url='')
+    server = SimpleNamespace(url='http://127.0.0.1:1/secret/', opening_url='', shared_url='')
     monkeypatch.setattr(watch_run.threading, 'Thread', None)
     for name in watch_run.DISPLAYS:
         monkeypatch.delenv(name, raising=False)

@@ -56,7 +56,7 @@ export class HandDriving {
 
   press(id, way) {
     const robot = this.model.selected;
-    if (!robot || this.model.recorded || this.held.has(id)) return;
+    if (!robot || this.model.looking || this.held.has(id)) return;
     this.robot ??= robot.name;
     this.held.set(id, way);
     this.timer ??= setInterval(() => this.repeat(), PERIOD);

@@ -9,6 +9,7 @@ import { MapDrawing, themeColors } from './map.js';
 import { Model } from './model.js';
 import { Notices } from './notices.js';
 import { MapPointer } from './pointer.js';
+import { Presets, prepareShare } from './presets.js';
 import { Settings } from './settings.js';
 import { showStatus } from './status.js';
 import { Strips } from './strips.js';
@@ -20,8 +21,12 @@ const HINTS = {
   goal: 'click: goal · drag: with heading · shift-click: waypoint · drag the robot: place it · WASD or arrow keys: drive',
   waypoint: 'click: a further place after the present goal · drag: with heading',
   move: 'drag: move the map · wheel or pinch: zoom',
+  look: 'you may look: drag: move the map · wheel or pinch: zoom',
   bag: 'drag: move the map · wheel or pinch: zoom · click a curve: go to that time · space: pause',
 };
+
+/** Size of the letters on the map (px). */
+const presetSize = () => (document.documentElement.dataset.projector === 'on' ? 17 : 11);
 
 let changed = true;
 const model = new Model(), view = new View(), notices = new Notices(byId('notices'));
@@ -37,6 +42,8 @@ const hand = new HandDriving(model, send), chain = new Chain(byId('chain'));
 const settings = new Settings(model, send), transport = new Transport(model, send);
 const strips = new Strips(byId('strips'), model, (time) => transport.seek(time));
 const capture = new Capture(byId('map'), model, notices);
+const presets = new Presets(model, send, () => { drawing.fontSize = presetSize(); changed = true; });
+prepareShare(model);
 followTheme(byId('theme'), () => { drawing.colors = themeColors(); changed = true; });
 
 const connection = new Connection((frame) => {
@@ -68,13 +75,15 @@ function showRobots() {
 }
 
 function showPanels() {
-  const robot = model.selected, recorded = model.recorded;
+  const robot = model.selected, { recorded, looking } = model;
   showRobots();
   showStatus(model, connection.open);
   transport.show();
   settings.show();
-  byId('hand').hidden = recorded || !robot;
-  byId('tools').hidden = byId('actions').hidden = byId('goto').hidden = recorded;
+  presets.show();
+  byId('hand').hidden = looking || !robot;
+  byId('tools').hidden = byId('actions').hidden = byId('goto').hidden = looking;
+  byId('share').hidden = !model.may.shared;
   byId('chain').hidden = byId('legend').hidden = !robot;
   byId('truth').hidden = !robot?.truth;
   byId('planned').hidden = !robot?.goal.path;
@@ -82,9 +91,9 @@ function showPanels() {
   setText(byId('title'), model.bag || 'diffdrive_jacobian');
   setText(byId('notes'), model.notes.join('; '));
   byId('notes').title = model.notes.join('\n');
-  setText(byId('hint'), HINTS[recorded ? 'bag' : pointer.tool]);
-  byId('map').classList.toggle('grab', recorded || pointer.tool === 'move');
-  if (robot) chain.show(robot, model.recorded);
+  setText(byId('hint'), HINTS[recorded ? 'bag' : looking ? 'look' : pointer.tool]);
+  byId('map').classList.toggle('grab', looking || pointer.tool === 'move');
+  if (robot) chain.show(robot, looking);
 }
 
 for (const button of byId('tools').children) {
@@ -123,7 +132,7 @@ byId('goto').addEventListener('submit', (event) => {
   else if (model.selected) send({ do: 'goal', robot: model.selected.name, x, y, theta, append: false });
 });
 addEventListener('keydown', (event) => {
-  if (event.code === 'Escape' && model.selected && !model.recorded) send({ do: 'cancel', robot: model.selected.name });
+  if (event.code === 'Escape' && model.selected && !model.looking) send({ do: 'cancel', robot: model.selected.name });
 });
 
 const STRIP_PERIOD = 80;

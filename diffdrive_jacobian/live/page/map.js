@@ -20,6 +20,7 @@ export class MapDrawing {
     this.model = model;
     this.angles = new Map();
     this.preview = null;
+    this.fontSize = 11;
     this.colors = themeColors();
   }
 
@@ -50,7 +51,7 @@ export class MapDrawing {
     const [left, top] = view.toWorld(0, 0), [right, bottom] = view.toWorld(width, height);
     const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
     context.lineWidth = 1;
-    context.font = '11px system-ui, sans-serif';
+    context.font = `${this.fontSize}px system-ui, sans-serif`;
     for (const [from, to, vertical] of [[left, right, true], [bottom, top, false]]) {
       for (let k = Math.ceil(from / step); k * step <= to; k += 1) {
         const [px, py] = view.toScreen(k * step, k * step);
@@ -157,7 +158,7 @@ export class MapDrawing {
     context.stroke();
     if (heading) this.drawArrow(context, px, py, goal[2], 42);
     if (label) {
-      context.font = '600 12px system-ui, sans-serif';
+      context.font = `600 ${this.fontSize + 1}px system-ui, sans-serif`;
       context.fillText(label, px + 12, py - 10);
     }
     context.globalAlpha = before;
@@ -187,11 +188,11 @@ export class MapDrawing {
     angles[1] += left * moves;
     this.angles.set(robot.name, angles);
     drawRobot(context, view, robot, robot.pose, angles, colors, { selected, ghost: false });
-    if (selected && !this.model.recorded) drawHandle(context, view, robot, colors);
+    if (selected && !this.model.looking) drawHandle(context, view, robot, colors);
     if (this.model.robots.size > 1) {
       const [px, py] = view.toScreen(robot.pose[0], robot.pose[1]);
       context.fillStyle = selected ? colors.text : colors.muted;
-      context.font = `${selected ? 600 : 400} 12px system-ui, sans-serif`;
+      context.font = `${selected ? 600 : 400} ${this.fontSize + 1}px system-ui, sans-serif`;
       context.fillText(robot.name, px + 10, py + robot.geometry[1] * 0.6 * view.scale + 16);
     }
   }
@@ -214,7 +215,7 @@ export class MapDrawing {
     context.moveTo(right - length, bottom - 4); context.lineTo(right - length, bottom);
     context.lineTo(right, bottom); context.lineTo(right, bottom - 4);
     context.stroke();
-    context.font = '11px system-ui, sans-serif';
+    context.font = `${this.fontSize}px system-ui, sans-serif`;
     context.textAlign = 'center';
     context.fillText(step < 1 ? `${Math.round(step * 100)} cm` : `${step} m`, right - length / 2, bottom - 6);
     context.textAlign = 'left';

@@ -58,6 +58,8 @@ export class Model {
     this.bag = '';
     this.notes = [];
     this.selectedName = null;
+    /** What the server lets this page do: a guest may only look, unless control was given. */
+    this.may = { steer: true, shared: '', guests_steer: false };
   }
 
   /** The robot that the panels show and commands go to; undefined: there is none. */
@@ -69,7 +71,13 @@ export class Model {
     return this.world.kind === 'bag';
   }
 
+  /** Whether nothing can be steered from here. */
+  get looking() {
+    return this.recorded || !this.may.steer;
+  }
+
   take(frame) {
+    this.may = frame.may ?? this.may;
     this.world = frame.world.kind ? frame.world : this.world;
     this.robots = new Map(frame.robots.map((robot) => [robot.name, robot]));
     for (const robot of frame.robots) {

@@ -36,7 +36,7 @@ export class MapPointer {
       this.action = { kind: 'pinch' };
       return;
     }
-    const moves = event.button !== 0 || this.tool === 'move' || this.model.recorded;
+    const moves = event.button !== 0 || this.tool === 'move' || this.model.looking;
     this.action = { kind: 'pan', start: place, last: place };
     if (!moves) this.action = this.steering(place, event.shiftKey);
     this.canvas.classList.toggle('moving', this.action.kind === 'pan');

@@ -57,7 +57,7 @@ export class Settings {
     const label = element('label', { htmlFor: id, title: row.hint }, ...math(row.label));
     const controls = { choice: this.choice, flag: this.flag }[row.kind] ?? this.number;
     const { nodes, set } = controls.call(this, row, id, label);
-    for (const node of nodes) node.disabled = this.model.recorded;
+    for (const node of nodes) node.disabled = this.model.looking;
     this.rows.set(row.key, set);
     return element('div', { class: 'setting', 'data-key': row.key, title: row.hint }, label, ...nodes);
   }

@@ -42,7 +42,7 @@ export function showStatus(model, open) {
     return;
   }
   byId('status').hidden = false;
-  const [badge, kind, sentence] = described(robot, model.recorded);
+  const [badge, kind, sentence] = described(robot, model.looking);
   setText(byId('state'), badge);
   byId('state').className = `badge ${kind}`;
   setText(byId('summary'), sentence);

@@ -32,7 +32,7 @@ export class Strips {
   }
 
   seek(event, canvas, onSeek) {
-    if (!this.model.recorded || !this.model.selected) return;
+    if (!this.model.recorded || !this.model.selected || !this.model.may.steer) return;
     const [from, to] = this.model.histories.get(this.model.selected.name).window(0);
     const box = canvas.getBoundingClientRect();
     onSeek(from + ((event.clientX - box.left - GUTTER) / (box.width - GUTTER)) * (to - from));

@@ -20,7 +20,7 @@ export class Transport {
     byId('time').addEventListener('pointerup', () => byId('time').blur());
     addEventListener('keydown', (event) => {
       if (event.code !== 'Space' || event.repeat || event.target.matches?.('input, select, button, summary')) return;
-      if (model.world.kind === 'robots') return;
+      if (model.world.kind === 'robots' || !model.may.steer) return;
       event.preventDefault();
       this.toggle();
     });
@@ -45,6 +45,7 @@ export class Transport {
     const bar = byId('transport');
     bar.hidden = kind === 'robots';
     if (bar.hidden) return;
+    for (const control of bar.querySelectorAll('button, input, select')) control.disabled = !this.model.may.steer;
     bar.classList.toggle('bag', kind === 'bag');
     setText(byId('play'), paused ? '▶' : '❚❚');
     byId('play').setAttribute('aria-label', paused ? 'Continue' : 'Pause');
