@@ -8,8 +8,10 @@ import math
 import os
 import re
 import signal
+import threading
 import time
 
+import numpy as np
 import pytest
 from chromium import Browser, find_chromium, until
 from PIL import Image
@@ -17,6 +19,9 @@ from support import processes
 from support.processes import open_world
 
 from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.live.session import Share
+from diffdrive_jacobian.live.value_page import drive_live
+from diffdrive_jacobian.signals import Signals
 
 pytestmark = [pytest.mark.browser, pytest.mark.process]
 
@@ -327,6 +332,78 @@ def test_a_still_and_a_film_of_the_map_are_saved(live, tmp_path):
     live.settled()
     browser.evaluate('document.getElementById("film").click()')
     assert len(until(lambda: saved('.mp4', '.webm'), 'the film is saved')) > 2_000
+    assert browser.errors == []
+
+
+@pytest.fixture
+def shared():
+    """A page of two robots without nodes, which guests may look at; and a browser of theirs."""
+    signals, servers, browser = Signals(), [], Browser()
+    how = {'lockstep': True, 'isolated': True, 'recording': None, 'ros_arguments': (), 'port': 0}
+    how |= {'parameters': {'kp': 2.0}, 'robot_parameters': {}, 'nodes_created': lambda names: None}
+    arguments = {**how, 'signals': signals, 'ready': servers.append, 'robots': 2}
+    goals = np.array([[50.0, 0.0, 0.0]])
+    share = Share('127.0.0.2')
+    driving = threading.Thread(target=lambda: drive_live(goals, **arguments, share=share))
+    driving.start()
+    try:
+        until(lambda: servers, 'the server runs')
+        yield servers[0], browser
+    finally:
+        browser.close()
+        signals.count = 1
+        driving.join(20.0)
+
+
+def test_guests_look_and_a_projector_shows_less_in_larger_type(shared):
+    server, browser = shared
+
+    def hidden(*names):
+        chosen = ', '.join(f'#{name}' for name in names)
+        return browser.evaluate(
+            f'[...document.querySelectorAll("{chosen}")].every((one) => one.offsetHeight === 0)'
+        )
+
+    browser.size(1280, 800)
+    browser.open(server.shared_url)
+    browser.until('document.querySelector("#robots button") !== null')
+    browser.until('document.querySelector("#sliders input") !== null')
+    assert hidden('tools', 'actions', 'goto', 'hand', 'share', 'presets')
+    assert browser.evaluate('document.querySelector("#sliders input").disabled')
+    assert browser.evaluate('document.getElementById("play").disabled')
+    assert browser.text('#hint').startswith('you may look')
+    x, y = browser.center('#map')
+    # Whoever sends a command is disconnected.
+    browser.click([x + 40, y])
+    browser.key('Down', 'KeyW')
+    browser.key('Up', 'KeyW')
+    browser.key('Down', 'Escape')
+    browser.drag([x, y], [x + 60, y + 60])
+    time.sleep(0.5)
+    assert browser.text('#connection') == 'connected'
+    assert browser.text('#state') == 'driving'
+
+    # The page of this machine, for a projector, with the address of the guests.
+    browser.open(server.url)
+    browser.until('document.querySelector("#sliders input") !== null')
+    size = 'parseFloat(getComputedStyle(document.querySelector(".numbers")).fontSize)'
+    before = browser.evaluate(size)
+    browser.evaluate('document.getElementById("projector").click()')
+    browser.until('document.querySelector("#choices button") !== null')
+    assert browser.evaluate(size) > 1.3 * before
+    assert hidden('settings', 'hand', 'goto')
+    browser.until(
+        '[...document.querySelectorAll(".preset")].some((one) => one.innerText.startsWith("K"))'
+    )
+    browser.evaluate(
+        '[...document.querySelectorAll(".preset")].find((one) => one.innerText.startsWith("K"))'
+        '.querySelector("button:last-child").click()'
+    )
+    browser.until('document.querySelector("#chain").innerText.includes("= 6")')
+    browser.evaluate('document.getElementById("share").click()')
+    browser.until('document.getElementById("code").naturalWidth > 0')
+    assert browser.text('#link') == server.shared_url
+    assert browser.text('#rights') == 'Whoever opens it can look, not steer.'
     assert browser.errors == []
 
 

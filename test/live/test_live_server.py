@@ -18,31 +18,64 @@ from diffdrive_jacobian.live import server as live_server
 from diffdrive_jacobian.live.commands import DriveByHand
 from diffdrive_jacobian.live.server import (
     MAX_INVALID,
-    MAX_PAGES,
     Access,
     LiveServer,
     Refusal,
 )
-from diffdrive_jacobian.live.session import Session, Snapshot
+from diffdrive_jacobian.live.session import Session, Share, Snapshot
 
 DRIVE = json.dumps({'do': 'drive', 'robot': '/', 'v': 0.2, 'omega': 0.0})
 
 
+GUESTS = '127.0.0.2'
+"""An address of this machine, as guests use one."""
+
+
+class Doors:
+    """A server, and the address and the token by which a test reaches it."""
+
+    def __init__(self, share=None):
+        self.server = LiveServer(Session(), share=share)
+        self.port = self.server.port
+        door = self.server._doors[-1]
+        self.host, self.token = (GUESTS if share else '127.0.0.1'), door.access.token
+        self.most = door.most
+
+    def close(self):
+        self.server.close()
+        assert not self.server._thread.is_alive()
+
+
+@pytest.fixture(params=['own', 'guests'])
+def server(request):
+    """A server, reached by its own address, or by that of guests to whom control was given."""
+    doors = Doors(Share(GUESTS, control=True) if request.param == 'guests' else None)
+    yield doors
+    doors.close()
+
+
 @pytest.fixture
-def server():
-    made = LiveServer(Session())
-    yield made
-    made.close()
-    assert not made._thread.is_alive()
+def own():
+    doors = Doors()
+    yield doors
+    doors.close()
+
+
+@pytest.fixture
+def guests():
+    """A server that is shared with guests who may only look, reached by their address."""
+    doors = Doors(Share(GUESTS))
+    yield doors
+    doors.close()
 
 
 def session_of(server):
-    return server._session
+    return server.server._session
 
 
 def get(server, path, **headers):
     """Request a path; return status, headers and body."""
-    connection = http.client.HTTPConnection('127.0.0.1', server.port, timeout=20)
+    connection = http.client.HTTPConnection(server.host, server.port, timeout=20)
     with contextlib.closing(connection):
         connection.putrequest('GET', path, skip_host='Host' in headers)
         for name, value in headers.items():
@@ -54,11 +87,11 @@ def get(server, path, **headers):
 
 def page(server, *, path=None, **headers):
     """Open the websocket, as a page of some origin would."""
-    own = f'127.0.0.1:{server.port}'
+    own = f'{server.host}:{server.port}'
     return connect(
-        f'ws://{headers.get("host", own)}{path or f"/{server.access.token}/socket"}',
+        f'ws://{headers.get("host", own)}{path or f"/{server.token}/socket"}',
         origin=headers.get('origin', f'http://{own}'),
-        sock=socket.create_connection(('127.0.0.1', server.port), timeout=20),
+        sock=socket.create_connection((server.host, server.port), timeout=20),
         proxy=None,
         open_timeout=20,
     )
@@ -102,7 +135,7 @@ def test_others_have_no_access():
 
 
 def test_the_page_with_its_token(server):
-    status, headers, body = get(server, f'/{server.access.token}/')
+    status, headers, body = get(server, f'/{server.token}/')
     assert status == 200
     assert body
     assert headers['X-Content-Type-Options'] == 'nosniff'
@@ -113,14 +146,14 @@ def test_the_page_with_its_token(server):
     assert headers['Referrer-Policy'] == 'no-referrer'
     assert 'Set-Cookie' not in headers
     for name in ('../server.py', '%2e%2e/server.py', '/etc/passwd', 'no.js', '..'):
-        assert get(server, f'/{server.access.token}/{name}')[0] == 404, name
+        assert get(server, f'/{server.token}/{name}')[0] == 404, name
 
 
 def test_requests_without_access_are_refused(server):
     status, headers, body = get(server, '/')
     assert (status, b'token' in body) == (403, True)
     assert 'Content-Security-Policy' in headers
-    path = f'/{server.access.token}/'
+    path = f'/{server.token}/'
     assert get(server, path, Host='evil.example')[0] == 403
     assert get(server, path, Origin='http://evil.example')[0] == 403
     for opened in (
@@ -134,18 +167,88 @@ def test_requests_without_access_are_refused(server):
     assert not session_of(server).watched
 
 
-def test_the_ticket_opens_the_page_once(server):
-    path = server.opening_url.removeprefix(f'http://127.0.0.1:{server.port}')
-    assert server.access.token not in path
-    status, headers, _ = get(server, path)
-    assert (status, headers['Location']) == (303, f'/{server.access.token}/')
-    assert get(server, path)[0] == get(server, '/open/')[0] == 403
+def test_the_ticket_opens_the_page_once(own):
+    path = own.server.opening_url.removeprefix(f'http://127.0.0.1:{own.port}')
+    assert own.token not in path
+    status, headers, _ = get(own, path)
+    assert (status, headers['Location']) == (303, f'/{own.token}/')
+    assert get(own, path)[0] == get(own, '/open/')[0] == 403
 
 
-def test_it_listens_on_this_machine_only(server):
-    assert server._socket.getsockname()[0] == '127.0.0.1'
+def test_it_listens_on_this_machine_only(own):
+    assert own.server._socket.getsockname()[0] == '127.0.0.1'
+    assert own.server.shared_url == ''
     with pytest.raises(OSError, match='in use'):
-        LiveServer(Session(), server.port)
+        LiveServer(Session(), own.port)
+    with pytest.raises(OSError, match='refused'):
+        socket.create_connection((GUESTS, own.port), timeout=5)
+
+
+# --- Guests
+
+
+def test_guests_have_a_token_and_a_host_of_their_own(guests):
+    inside = guests.server.access
+    assert guests.server.shared_url == f'http://{GUESTS}:{guests.port}/{guests.token}/'
+    assert guests.token != inside.token
+    assert get(guests, f'/{guests.token}/')[0] == 200
+    # What is true of one address is not of the other.
+    assert get(guests, f'/{inside.token}/')[0] == 403
+    assert get(guests, f'/open/{inside.ticket}')[0] == get(guests, '/open/')[0] == 403
+    assert get(guests, f'/{guests.token}/', Host=f'127.0.0.1:{guests.port}')[0] == 403
+    assert get(guests, f'/{guests.token}/', Host='localhost')[0] == 403
+    for opened in ({'path': f'/{inside.token}/socket'}, {'origin': f'http://127.0.0.1:{guests.port}'}):
+        with pytest.raises(InvalidStatus, match='403'):
+            page(guests, **opened)
+    guests.host = '127.0.0.1'
+    assert get(guests, f'/{guests.token}/')[0] == 403
+    status, headers, code = get(guests, f'/{inside.token}/share.svg')
+    assert (status, headers['Content-Type']) == (200, 'image/svg+xml')
+    assert code.startswith(b'<?xml')
+
+
+def test_guests_look_and_whoever_steers_is_disconnected(guests):
+    session = session_of(guests)
+    session.store(Snapshot(world={'kind': 'robots'}))
+    with page(guests) as guest, page(guests) as other:
+        may = json.loads(guest.recv(timeout=20))['may']
+        assert may == {'steer': False, 'shared': '', 'guests_steer': False}
+        assert 'may' in json.loads(other.recv(timeout=20))
+        guest.send(DRIVE)
+        assert closed(guest) == 1008
+        assert session.take_commands() == []
+        session.store(Snapshot(world={'kind': 'lockstep'}))
+        frame = json.loads(other.recv(timeout=20))
+        assert (frame['world']['kind'], 'may' in frame) == ('lockstep', False)
+    guests.host, guests.token = '127.0.0.1', guests.server.access.token
+    with page(guests) as inside:
+        may = json.loads(inside.recv(timeout=20))['may']
+        assert may == {
+            'steer': True,
+            'shared': guests.server.shared_url,
+            'guests_steer': False,
+        }
+        inside.send(DRIVE)
+        until(session.take_commands, 'the page of this machine is served')
+
+
+def test_guests_cannot_keep_the_page_of_this_machine_from_its_owner(guests, monkeypatch):
+    monkeypatch.setattr(live_server, 'MAX_STRANGERS', 4)
+    with contextlib.ExitStack() as stack:
+        for _ in range(12):
+            stack.enter_context(socket.create_connection((GUESTS, guests.port), timeout=20))
+        guests.host, guests.token = '127.0.0.1', guests.server.access.token
+        with page(guests) as inside:
+            inside.send(DRIVE)
+            until(session_of(guests).take_commands, 'it is served')
+
+
+def test_an_address_that_is_none_of_this_machine_leaves_nothing_open():
+    with socket.create_server(('127.0.0.1', 0)) as free:
+        port = free.getsockname()[1]
+    for _ in range(2):
+        with pytest.raises(OSError, match='assign'):
+            LiveServer(Session(), port, Share('192.0.2.200'))
 
 
 # --- What it withstands
@@ -202,7 +305,7 @@ def test_large_messages_and_too_many_pages_are_disconnected(server):
             assert closed(bad) == 1009
     until(lambda: not session_of(server).watched, 'the pages are gone')
     with contextlib.ExitStack() as stack:
-        for _ in range(MAX_PAGES):
+        for _ in range(server.most):
             stack.enter_context(page(server))
         assert closed(stack.enter_context(page(server))) == 1013
 
@@ -213,14 +316,14 @@ def test_what_is_no_http_is_disconnected(server):
         b'GET / HTTP/1.1\r\n' + b'a: b\r\n' * 500,
         b'POST / HTTP/1.1\r\n\r\n',
     ):
-        with socket.create_connection(('127.0.0.1', server.port), timeout=20) as raw:
+        with socket.create_connection((server.host, server.port), timeout=20) as raw:
             raw.sendall(garbage)
             received = b''
             with contextlib.suppress(ConnectionResetError):
                 while data := raw.recv(4096):
                     received += data
             assert b'200' not in received.split(b'\r\n')[0]
-    assert get(server, f'/{server.access.token}/')[0] == 200
+    assert get(server, f'/{server.token}/')[0] == 200
 
 
 def test_connections_that_ask_for_nothing_do_not_use_up_descriptors(monkeypatch, server):
@@ -229,10 +332,10 @@ def test_connections_that_ask_for_nothing_do_not_use_up_descriptors(monkeypatch,
     monkeypatch.setattr(live_server, 'PATIENCE', 1e3)
     with page(server) as first, contextlib.ExitStack() as stack:
         idle = [
-            stack.enter_context(socket.create_connection(('127.0.0.1', server.port), timeout=20))
+            stack.enter_context(socket.create_connection((server.host, server.port), timeout=20))
             for _ in range(20)
         ]
-        assert get(server, f'/{server.access.token}/')[0] == 200
+        assert get(server, f'/{server.token}/')[0] == 200
         # Those that the server has disconnected can be read.
         until(lambda: len(select.select(idle, [], [], 0)[0]) >= 4, 'others are disconnected')
         first.send(DRIVE)
@@ -256,10 +359,9 @@ def test_a_page_that_does_not_read_delays_nobody(server):
 
 
 def test_it_ends_while_pages_are_open():
-    server = LiveServer(Session())
+    server = Doors(Share(GUESTS, control=True))
     with page(server) as open_page:
         server.close()
-        assert not server._thread.is_alive()
         assert closed(open_page) == 1001
     with pytest.raises(OSError, match='refused'):
         socket.create_connection(('127.0.0.1', server.port), timeout=5)

@@ -148,7 +148,28 @@ def test_without_a_display_the_address_is_printed_and_no_browser_started(monkeyp
     assert f'page: {server.url}' in capsys.readouterr().out
 
 
+def test_the_address_for_guests_is_printed_with_what_it_allows(capsys):
+    server = SimpleNamespace(url='http://127.0.0.1:1/a/', shared_url='http://192.168.1.7:1/b/')
+    for control, words in ((False, 'that address can look'), (True, 'that address can STEER')):
+        watch_run.announcing(SimpleNamespace(no_browser=True, share_control=control))(server)
+        out = capsys.readouterr().out
+        assert f'guests: {server.shared_url}' in out
+        assert words in out
+        assert 'not encrypted' in out
+
+
 # --- What prevents the page
+
+
+@pytest.mark.parametrize('address', ['0.0.0.0', '127.0.0.1', '224.0.0.1', '::', 'robot.local', ''])
+def test_an_address_that_is_not_one_of_this_machine_is_refused(address):
+    assert 'by which others reach this machine' in commands.refused('watch_run', '--share', address)
+
+
+def test_addresses_of_this_machine_are_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    message = commands.refused('drive_to', '--live', '--no-browser', '--share', '203.0.113.7', code=1)
+    assert '--share 203.0.113.7 is no address of this machine, which has ' in message
 
 
 def test_a_port_in_use_is_named(tmp_path, monkeypatch):
