@@ -17,7 +17,6 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.parameters.arguments import resembling
 from diffdrive_jacobian.parameters.declaration import (
     NodeParameters,
     Parameter,
@@ -149,6 +148,7 @@ def report_unknown(nodes: Sequence[Node], others: Iterable[Node] = ()) -> None:
         return
     # Slow to import.
     from diffdrive_jacobian.control.controllers import names_of_gains
+    from diffdrive_jacobian.parameters.arguments import resembling
     from diffdrive_jacobian.parameters.nodes import NODE_PARAMETERS
 
     ours = {name for one in NODE_PARAMETERS for name in one.declared()}

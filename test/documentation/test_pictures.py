@@ -125,7 +125,7 @@ def test_the_elbow_moves_and_damping_bounds_the_joints():
 
 def test_every_picture_is_public_in_the_documentation_and_in_the_help():
     figures = {f'{what}_figure' for what in ('calibration', 'run', 'sweep')}
-    assert {*plots.PICTURES, 'PICTURES', *figures} == {*plots.__all__}
+    assert {*plots.PICTURES, 'PICTURES', 'Film', *figures} == {*plots.__all__}
     table = (ROOT / 'doc' / 'documents.md').read_text().split('| name | shows |', 1)[1].split('\n\n')[0]
     assert dict(re.findall(r'^\| `(\w+)` \| (.*) \|$', table, re.MULTILINE)) == plots.PICTURES
     helped = run('--help').out
