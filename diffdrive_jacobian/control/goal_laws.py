@@ -21,13 +21,13 @@ from diffdrive_jacobian.kinematics import diff_drive
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import offset, positive
 from diffdrive_jacobian.numerics.elementary import atan2, cos, hypot, sin, sinc, where, wrap
-from diffdrive_jacobian.numerics.formula import Number, Vector, formula
+from diffdrive_jacobian.numerics.formula import Number, Scalar, Vector, formula
 
 # --- To a position
 
 
 @formula('(3),(2),(),() -> (),()')
-def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Number, Number]:
+def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Scalar, Scalar]:
     """Compute the twist that drives a unicycle to a position.
 
     `e = wrap(atan2(y_g - y, x_g - x) - theta)`, `omega = Kp e`, `v = Kv d cos(e)`, where d is the
@@ -79,7 +79,7 @@ GO_TO_GOAL = Controller(
 
 
 @formula('(),(),() -> (),()')
-def turn_in_place(theta: Number, heading: Number, Kp: Number) -> tuple[Number, Number]:
+def turn_in_place(theta: Number, heading: Number, Kp: Number) -> tuple[Scalar, Scalar]:
     """Compute the twist that turns to a heading by the smaller angle.
 
     `v = 0`, `omega = Kp wrap(heading - theta)`, of headings (rad) and the gain Kp (1/s), each of shape
@@ -95,7 +95,7 @@ def turn_in_place(theta: Number, heading: Number, Kp: Number) -> tuple[Number, N
 
 
 @formula('(3),(2),(),() -> (),()', d=offset)
-def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Number, Number]:
+def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Scalar, Scalar]:
     """Compute the twist that drives the offset point along a straight line: `p_d_dot = k (goal - p_d)`.
 
     Unlike the axle centre, whose Jacobian has rank 1, a point at a distance in front of it (behind it,
@@ -156,7 +156,7 @@ bounds the part of `|d omega / d alpha|` in `go_to_pose` that depends on phi."""
 @formula('(3),(3),(),(),() -> (),()', Kp=positive, Kv=positive, h=positive)
 def go_to_pose(
     state: Vector, goal: Vector, Kp: Number, Kv: Number, h: Number = None
-) -> tuple[Number, Number]:
+) -> tuple[Scalar, Scalar]:
     """Compute the twist that drives a unicycle to a position and a heading.
 
     rho is the distance to the goal, alpha its bearing as seen from the robot's heading, and phi the same

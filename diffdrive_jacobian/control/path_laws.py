@@ -25,7 +25,7 @@ from diffdrive_jacobian.kinematics import diff_drive
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import not_negative, offset, positive
 from diffdrive_jacobian.numerics.elementary import cos, hypot, maximum, sin, where, wrap
-from diffdrive_jacobian.numerics.formula import Number, Vector, formula
+from diffdrive_jacobian.numerics.formula import Number, Scalar, Vector, formula
 
 
 def _gain(name: str, label: str, default: float, unit: str, description: str) -> Gain:
@@ -43,7 +43,7 @@ def _gain(name: str, label: str, default: float, unit: str, description: str) ->
 
 
 @formula('(3),(8),() -> (),()', l_d=positive)
-def pure_pursuit(state: Vector, reference: Vector, l_d: Number) -> tuple[Number, Number]:
+def pure_pursuit(state: Vector, reference: Vector, l_d: Number) -> tuple[Scalar, Scalar]:
     """Compute the twist along the circle through a point of the path at the look-ahead distance.
 
     `omega = 2 v y / l_d^2`, where y is the coordinate of the point to the left in the body frame
@@ -82,7 +82,7 @@ PURE_PURSUIT = PathController(
 @formula('(3),(8),(),(),() -> (),()', K_x=not_negative, K_y=not_negative, K_theta=not_negative)
 def kanayama(
     state: Vector, reference: Vector, K_x: Number, K_y: Number, K_theta: Number
-) -> tuple[Number, Number]:
+) -> tuple[Scalar, Scalar]:
     """Compute the twist of the tracking control of Kanayama, Kimura, Miyazaki and Noguchi 1990.
 
     With the errors in the body frame, `e = R(theta)^T (p_r - p)`, `e_theta = wrap(theta_r - theta)`: `v
@@ -127,7 +127,7 @@ KANAYAMA = PathController(
 @formula('(3),(8),(),() -> (),()', d=offset)
 def offset_point_tracking(
     state: Vector, reference: Vector, k: Number, d: Number
-) -> tuple[Number, Number]:
+) -> tuple[Scalar, Scalar]:
     """Compute the twist that lets the offset point track another: `p_d_dot = p_dot_r + k (p_r - p_d)`.
 
     `p_r` is the offset point of a robot that is where the reference is, so that the axle centre, not the

@@ -30,7 +30,7 @@ from diffdrive_jacobian.numerics.checks import (
     read_only,
 )
 from diffdrive_jacobian.numerics.elementary import hypot, wrap
-from diffdrive_jacobian.numerics.formula import Number, formula
+from diffdrive_jacobian.numerics.formula import Number, Scalar, formula
 
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
 STANDSTILL = (0.0, 0.0)
@@ -41,7 +41,7 @@ LawWithGains: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
 @formula('(),(),(),(),(),() -> ()')
 def distance_to_goal(
     x: Number, y: Number, theta: Number, x_goal: Number, y_goal: Number, offset: Number
-) -> Number:
+) -> Scalar:
     """Compute the distance of the point at x = offset in the body frame from a goal, shape (...) (m)."""
     x_d, y_d = offset_point.formula((x, y, theta), offset)
     return hypot(x_goal - x_d, y_goal - y_d)

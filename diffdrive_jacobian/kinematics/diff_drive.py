@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from diffdrive_jacobian.numerics.checks import offset, positive
 from diffdrive_jacobian.numerics.elementary import cos, product, sin
-from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
+from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Scalar, Vector, formula
 
 __all__ = [
     'body_to_wheel',
@@ -165,7 +165,7 @@ def offset_point_jacobian(theta: Number, r: Number, L: Number, d: Number) -> Row
 
 
 @formula('(),(),(),() -> (),()', r=positive, L=positive)
-def body_to_wheel(v: Number, omega: Number, r: Number, L: Number) -> tuple[Number, Number]:
+def body_to_wheel(v: Number, omega: Number, r: Number, L: Number) -> tuple[Scalar, Scalar]:
     """Return the wheel speeds of a body twist, `J_w^-1 u` in scalar form (A, inverse of (8)).
 
     For v (m/s), omega (rad/s), r and L (m), the result is `(omega_R, omega_L)` (rad/s), each of shape
@@ -177,7 +177,7 @@ def body_to_wheel(v: Number, omega: Number, r: Number, L: Number) -> tuple[Numbe
 
 
 @formula('(),(),(),() -> (),()', r=positive, L=positive)
-def wheel_to_body(omega_R: Number, omega_L: Number, r: Number, L: Number) -> tuple[Number, Number]:
+def wheel_to_body(omega_R: Number, omega_L: Number, r: Number, L: Number) -> tuple[Scalar, Scalar]:
     """Return the body twist of wheel speeds, `J_w w` in scalar form (A(8)).
 
     For omega_R and omega_L (rad/s), r and L (m), the result is `(v, omega)` (m/s, rad/s), each of shape

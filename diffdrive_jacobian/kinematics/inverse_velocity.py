@@ -87,6 +87,7 @@ from diffdrive_jacobian.numerics.formula import (
     Array,
     Number,
     Rows,
+    Scalar,
     Vector,
     entries_first,
     entries_last,
@@ -168,7 +169,7 @@ def masked_task(J: Any, x_dot: Vector, mask: Vector) -> tuple[Array, Array]:
 
 
 @formula('(),(),() -> ()', manipulability=not_negative, threshold=positive, maximum=not_negative)
-def damping(manipulability: Number, threshold: Number, maximum: Number) -> Number:
+def damping(manipulability: Number, threshold: Number, maximum: Number) -> Scalar:
     """Return a lambda that grows as the manipulability falls: `lambda_max (1 - w / w_0)`, or 0.
 
     Document A asks for such a lambda without a formula. It has the units of J (Nakamura and Hanafusa
@@ -320,7 +321,7 @@ def _checked(tasks: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[Array, 
 
 
 @formula('(m,n) -> ()')
-def manipulability(J: Any) -> Number:
+def manipulability(J: Any) -> Scalar:
     """Return Yoshikawa's distance of a Jacobian from singular: `w = sqrt(det(J J^T))`.
 
     It is the product of the singular values, shape (...), 0 where J is singular. Also 0 where it has

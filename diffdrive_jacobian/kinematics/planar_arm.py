@@ -33,7 +33,7 @@ from diffdrive_jacobian.numerics.elementary import (
     where,
     wrap,
 )
-from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
+from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Scalar, Vector, formula
 
 __all__ = ['PlanarArm', 'arm_forward_kinematics', 'arm_jacobian']
 
@@ -153,7 +153,7 @@ class PlanarArm(Comparable):
         return np.concatenate([J, np.ones_like(J[..., :1, :])], axis=-2)
 
     @formula('(_two_links) -> ()')
-    def determinant(self, q: Vector) -> Number:
+    def determinant(self, q: Vector) -> Scalar:
         """Return the determinant of the Jacobian of two links: `l1 l2 sin(q_2)` (A).
 
         The result has the shape (...) (m^2).
@@ -234,7 +234,7 @@ class PlanarArm(Comparable):
         return [(d * v_x - b * v_y) / determinant, (a * v_y - c * v_x) / determinant]
 
     @formula('(joints),(2) -> ()')
-    def clearance(self, q: Vector, obstacle: Vector) -> Number:
+    def clearance(self, q: Vector, obstacle: Vector) -> Scalar:
         """Return the distance of the arm from an obstacle, a point, to the nearest point of its links.
 
         Obstacles have the shape (..., 2), the result (...) (m).

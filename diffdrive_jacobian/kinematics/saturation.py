@@ -25,7 +25,7 @@ from diffdrive_jacobian.numerics.checks import (
     positive_or_infinite,
 )
 from diffdrive_jacobian.numerics.elementary import all_finite, maximum, minimum, where
-from diffdrive_jacobian.numerics.formula import Number, formula
+from diffdrive_jacobian.numerics.formula import Number, Scalar, formula
 
 ROUNDING = 2.0**-49
 """By how much a computed wheel speed may be beyond its limit, relative to it."""
@@ -115,7 +115,7 @@ def scaled_to_limits(
     max_wheel_speed: Number,
     r: Number,
     L: Number,
-) -> tuple[Number, Number]:
+) -> tuple[Scalar, Scalar]:
     """Return what `saturate` does, for limits that are given one by one."""
     v_limit, omega_limit = where(v > 0.0, max_v, min_v), where(omega > 0.0, max_omega, min_omega)
     v, omega = where(v_limit == 0.0, 0.0, v), where(omega_limit == 0.0, 0.0, omega)

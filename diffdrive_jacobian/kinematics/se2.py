@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from diffdrive_jacobian.numerics.elementary import cos, sin, sinc_defect, wrap
 from diffdrive_jacobian.numerics.elementary import sinc as sin_ratio
-from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
+from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Scalar, Vector, formula
 
 __all__ = [
     'adjoint',
@@ -33,7 +33,7 @@ __all__ = [
 
 
 @formula('() -> ()')
-def wrap_angle(angle: Number) -> Number:
+def wrap_angle(angle: Number) -> Scalar:
     """Wrap angles to (-pi, pi].
 
     Angles have any shape (rad). The result is exact with respect to the double nearest to 2 pi. An angle
@@ -43,7 +43,7 @@ def wrap_angle(angle: Number) -> Number:
 
 
 @formula('() -> ()')
-def sinc(angle: Number) -> Number:
+def sinc(angle: Number) -> Scalar:
     """Compute sin(angle) / angle, which is 1 at zero (not NumPy's sin(pi x) / (pi x)).
 
     Angles have any shape (rad).

@@ -55,6 +55,8 @@ __all__ = ['formula']
 Array: TypeAlias = NDArray[np.float64]
 Number: TypeAlias = Any
 """A float, or an array that broadcasts to the shape of a batch."""
+Scalar: TypeAlias = float | Array
+"""A number as a result: a float, or an array of the shape of a batch."""
 Vector: TypeAlias = Any
 """A vector as an argument: its numbers in a sequence, or an array with its entries first."""
 Entries: TypeAlias = list[Number]

@@ -84,7 +84,7 @@ def arm_ellipses(
         (1.0 / iv.condition_number(J), ':', '$s_2/s_1$'),
     ):
         below.plot(travelled, values, style, color='black', lw=1.6)
-        sketch.label(below, text, [travelled[-1], values[-1]], (6.0, 0.0), ha='left')
+        sketch.label(below, text, [travelled[-1], np.ravel(values)[-1]], (6.0, 0.0), ha='left')
     below.set(xlabel='distance travelled by the tip [m]', ylim=(0.0, None), xlim=travelled[[0, -1]])
     return drawing
 

@@ -79,7 +79,7 @@ def figure_1(r: float = 0.033, L: float = 0.16) -> Figure:
     sketch.arrow(axes, C, [1.45 * L, 0.0], '$x$', (10.0, 0.0), lw=1.0)
     sketch.arrow(axes, C, [0.0, 0.85 * L], '$y$', (0.0, 10.0), lw=1.0)
     v_x, _ = diff_drive.wheel_to_body(OMEGA_2, OMEGA_1, r, L)
-    sketch.arrow(axes, C, [SECONDS * v_x, 0.0], '$v_x$', (0.0, 13.0), color=BLUE, lw=2.6)
+    sketch.arrow(axes, C, [SECONDS * float(v_x), 0.0], '$v_x$', (0.0, 13.0), color=BLUE, lw=2.6)
     sketch.angle(axes, C, 0.22 * L, 2.2, 4.1, r'$\dot\theta$', color=BLUE)
     sketch.point(axes, C, '$C$', (11.0, -12.0))
     C_2, C_1 = diff_drive.wheel_centres(ORIGIN, L)
