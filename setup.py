@@ -1,8 +1,10 @@
 """Package diffdrive_jacobian, for colcon and for pip."""
 
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
+from setuptools.command.sdist import sdist
 
 PACKAGE = 'diffdrive_jacobian'
 COMMANDS = [
@@ -24,13 +26,55 @@ COMMANDS = [
     'calibrate_run',
     'grade_hand_ins',
 ]
+NOT_IN_PACKAGE = ('doc', 'test', 'config', 'resource')
+"""Folders that a source distribution has beside the package."""
 MESSAGES = '5.3.6'
 CORE_MESSAGES = '2.0.3'
+
+
+class SourceDistribution(sdist):
+    """With the tests and the pages, as a clone has them."""
+
+    def add_defaults(self):
+        """Add what is no part of the package."""
+        super().add_defaults()
+        files = (path for folder in NOT_IN_PACKAGE for path in Path(folder).rglob('*'))
+        kept = (path for path in files if path.is_file() and '__pycache__' not in path.parts)
+        beside = (
+            'CHANGELOG.rst',
+            'LICENSE',
+            'package.xml',
+            *glob('.ci/*'),
+            *glob('.*.ini'),
+            '.ruff.toml',
+        )
+        self.filelist.extend(sorted([*map(str, kept), *beside]))
+
 
 setup(
     name=PACKAGE,
     version='0.1.0',
     description='A virtual differential-drive robot, driven to goals through the mobile-robot Jacobian.',
+    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    keywords=['ROS', 'differential drive', 'mobile robot', 'Jacobian', 'simulation', 'testing'],
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Framework :: Pytest',
+        'Intended Audience :: Developers',
+        'Intended Audience :: Education',
+        'Intended Audience :: Science/Research',
+        'Operating System :: OS Independent',
+        'Programming Language :: Python :: 3.10',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Programming Language :: Python :: 3.13',
+        'Topic :: Education',
+        'Topic :: Scientific/Engineering',
+        'Topic :: Software Development :: Testing',
+        'Typing :: Typed',
+    ],
+    cmdclass={'sdist': SourceDistribution},
     author='The diffdrive_jacobian developers',
     author_email='maintainers@example.com',
     license='Apache-2.0',
@@ -92,7 +136,11 @@ setup(
     },
     zip_safe=False,
     entry_points={
-        'console_scripts': [f'{name} = {PACKAGE}.tools.entry_points:{name}' for name in COMMANDS],
+        'console_scripts': [
+            *(f'{name} = {PACKAGE}.tools.entry_points:{name}' for name in COMMANDS),
+            # Other packages have a doctor, too.
+            f'diffdrive_doctor = {PACKAGE}.tools.entry_points:doctor',
+        ],
         # Each name is that of the module, so that `pytest_plugins` with it does not load it twice.
         'pytest11': [
             f'{module} = {module}'
