@@ -35,20 +35,13 @@ CORE_MESSAGES = '2.0.3'
 class SourceDistribution(sdist):
     """With the tests and the pages, as a clone has them."""
 
-    def add_defaults(self):
+    def make_distribution(self):
         """Add what is no part of the package."""
-        super().add_defaults()
         files = (path for folder in NOT_IN_PACKAGE for path in Path(folder).rglob('*'))
         kept = (path for path in files if path.is_file() and '__pycache__' not in path.parts)
-        beside = (
-            'CHANGELOG.rst',
-            'LICENSE',
-            'package.xml',
-            *glob('.ci/*'),
-            *glob('.*.ini'),
-            '.ruff.toml',
-        )
+        beside = ('CHANGELOG.rst', 'LICENSE', 'package.xml', '.mypy.ini', '.ruff.toml', *glob('.ci/*'))
         self.filelist.extend(sorted([*map(str, kept), *beside]))
+        super().make_distribution()
 
 
 setup(
