@@ -20,6 +20,9 @@ if TYPE_CHECKING:
         spatial,
         spatial_arm,
     )
+    from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator as MobileManipulator
+    from diffdrive_jacobian.kinematics.planar_arm import PlanarArm as PlanarArm
+    from diffdrive_jacobian.kinematics.spatial_arm import SpatialArm as SpatialArm
 
 __all__ = [
     'contact',
@@ -36,4 +39,11 @@ __all__ = [
 ]
 if not TYPE_CHECKING:
     # Nodes, which need few of them, start faster than with all.
-    __getattr__, __dir__ = lazy.attach(__name__, {name: f'kinematics.{name}' for name in __all__})
+    _MODULES = {name: f'kinematics.{name}' for name in __all__}
+    # Short paths of the classes, which are listed under their modules.
+    _CLASSES = {
+        'MobileManipulator': 'kinematics.mobile_manipulator',
+        'PlanarArm': 'kinematics.planar_arm',
+        'SpatialArm': 'kinematics.spatial_arm',
+    }
+    __getattr__, __dir__ = lazy.attach(__name__, _MODULES | _CLASSES)

@@ -16,10 +16,10 @@ NAMES = [
     kinematics.se3,  # type: ignore[attr-defined]
     simulation.close_loops,  # type: ignore[attr-defined]
     testing.explor,  # type: ignore[attr-defined]
-    # Public in testing, in kinematics.planar_arm, and in the package itself.
+    # Public in testing, and in the package itself.
     exploration.explore,  # type: ignore[attr-defined]
     lockstep.Lockstep,  # type: ignore[attr-defined]
     properties.PropertyViolation,  # type: ignore[attr-defined]
-    kinematics.PlanarArm,  # type: ignore[attr-defined]
+    kinematics.PlanarChain,  # type: ignore[attr-defined]
     testing.faults,  # type: ignore[attr-defined]
 ]
