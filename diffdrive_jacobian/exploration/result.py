@@ -283,6 +283,7 @@ def reproducing(world: Lockstep | None, case: Path) -> Iterator[None]:
             violation = of_exception(error, 0.0 if world is None else world.world_seconds)
             digest = getattr(error, 'digest', '') if messages is None else messages.value()
             compared = Replay.compared(violation, digest, found, fields['versions'])
-            # As add_note of Python 3.11.
-            error.__notes__ = [*getattr(error, '__notes__', []), str(compared)]  # type: ignore[union-attr]
+            # As add_note of Python 3.11, whose types are those of one version alone.
+            notes = [*getattr(error, '__notes__', []), str(compared)]
+            setattr(error, '__notes__', notes)  # noqa: B010
             raise

@@ -32,7 +32,7 @@ TOOLS = {
     one.name
     for one in installed_entry_points(group='console_scripts')
     if one.value.startswith('diffdrive_jacobian.tools.')
-} - {*NODES}
+} - {*NODES, 'diffdrive_doctor'}
 ITEMS = 138
 """What the five documents say, by the list of their items."""
 

@@ -185,7 +185,9 @@ def test_installed_commands_start():
     """All have a script; one is started as a new process, with its imports."""
     installed = distribution('diffdrive_jacobian').entry_points.select(group='console_scripts')
     assert {one.name: one.value for one in installed} == {
-        command: f'{entry_points.__name__}:{command}' for command in COMMANDS
+        **{command: f'{entry_points.__name__}:{command}' for command in COMMANDS},
+        # Others have a doctor, too.
+        'diffdrive_doctor': f'{entry_points.__name__}:doctor',
     }
     scripts = [Path(sysconfig.get_path('scripts'), command) for command in COMMANDS]
     assert all(os.access(script, os.X_OK) for script in scripts)
