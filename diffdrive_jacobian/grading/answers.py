@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 LONGEST = 160
 """Longest text of a value (characters)."""
@@ -24,6 +25,16 @@ def _text(value: Any) -> str:
     return f'{value:.6g}' if isinstance(value, float) else repr(value)
 
 
+def as_numbers(value: Any) -> NDArray[np.float64] | None:
+    """Return numbers as an array. None: they are none. Texts are not, even of digits."""
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        # Lists of different lengths.
+        return None
+    return array.astype(np.float64) if array.dtype.kind in 'biuf' else None
+
+
 def agree(found: Any, expected: Any, what: str, *, within: float = 1e-6) -> None:
     """Require that an answer is right.
 
@@ -37,10 +48,7 @@ def agree(found: Any, expected: Any, what: str, *, within: float = 1e-6) -> None
         AssertionError: It is not. The message is for the student.
     """
     wanted = np.asarray(expected, dtype=np.float64)
-    try:
-        got = None if found is None else np.asarray(found, dtype=np.float64)
-    except (TypeError, ValueError):
-        got = None
+    got = as_numbers(found)
     if got is None:
         raise AssertionError(f'{what} must be {shown(wanted)}, got {shown(found)}')
     if got.shape != wanted.shape:

@@ -6,12 +6,15 @@ import csv
 import io
 import json
 import os
+import secrets
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,8 @@ from diffdrive_jacobian.text import printable
 
 SECONDS = 120.0
 """Longest duration of the grading of one hand-in (s)."""
+POLL = 0.1
+"""Time between two looks at whether to stop (s)."""
 FOLDER = Path(__file__).parents[1] / 'exercises'
 """The exercises of this package."""
 
@@ -112,55 +117,102 @@ def grade(
     Raises:
         GradingError: The exercise fails, whatever the hand-in.
     """
-    failed = False
+    _check(exercise)
+    names = _pictures(hand_ins, pictures)
 
-    def one(hand_in: Path) -> Graded | None:
-        nonlocal failed
-        if failed or stopped():
+    def one(number: int) -> Graded | None:
+        if stopped():
             return None
-        try:
-            found = _grade(exercise, hand_in, seconds, pictures)
-        except GradingError:
-            # An interruption ends pytest, too.
-            if stopped():
-                return None
-            failed = True
-            raise
-        graded(found)
-        return found
+        return _grade(exercise, hand_ins[number], seconds, names[number], stopped)
 
+    found = []
     with ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool:
-        return [found for found in pool.map(one, hand_ins) if found is not None]
+        for result in pool.map(one, range(len(hand_ins))):
+            if result is not None:
+                graded(result)
+                found.append(result)
+    return found
 
 
-def _grade(exercise: Path, hand_in: Path, seconds: float, pictures: Path | None) -> Graded:
-    begin = time.monotonic()
+def _pictures(hand_ins: Sequence[Path], folder: Path | None) -> list[Path | None]:
+    """Return the file of each picture. Hand-ins of the same name have that of their folder before it."""
+    stems = [one.stem for one in hand_ins]
+    names = [
+        stem if stems.count(stem) == 1 else f'{number}_{one.resolve().parent.name}_{stem}'
+        for number, (one, stem) in enumerate(zip(hand_ins, stems, strict=True), 1)
+    ]
+    return [None if folder is None else folder.resolve() / f'{name}.png' for name in names]
+
+
+def _pytest(*arguments: str) -> list[str]:
+    return [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', '-c', os.devnull, *arguments]
+
+
+def _check(exercise: Path) -> None:
+    """Raise GradingError if an exercise has no tests, whatever the hand-in."""
     with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder, 'grades.json')
-        command = [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', '--rootdir', folder]
-        command += [*('-c', os.devnull, '--hand-in', str(hand_in.resolve()), '--grades', str(report))]
-        if pictures is not None:
-            command += ['--pictures', str(pictures.resolve())]
-        error = ''
-        try:
-            ended = subprocess.run(
-                [*command, str(exercise)],
-                cwd=folder,
-                capture_output=True,
-                text=True,
-                errors='replace',
-                stdin=subprocess.DEVNULL,
-                timeout=seconds,
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
-            ended, error = None, f'not graded: it took longer than {seconds:g} s'
-        grades = json.loads(report.read_text(encoding='utf-8')) if report.exists() else []
-        if ended is not None and (ended.returncode not in (0, 1) or not grades):
-            lines = (ended.stdout + ended.stderr).strip().splitlines() or ['it printed nothing']
-            why = [line for line in lines if line.startswith('E ')] or lines[-1:]
-            raise GradingError(f'{exercise} grades nothing: {why[-1].removeprefix("E").strip()}')
-    return Graded(hand_in=hand_in, grades=tuple(grades), seconds=time.monotonic() - begin, error=error)
+        command = _pytest('--rootdir', folder, '--collect-only', str(exercise))
+        ended = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, errors='replace', check=False
+        )
+    if ended.returncode:
+        lines = (ended.stdout + ended.stderr).strip().splitlines() or ['it printed nothing']
+        why = [line for line in lines if line.startswith('E ')] or lines[-1:]
+        raise GradingError(f'{exercise} grades nothing: {why[-1].removeprefix("E").strip()}')
+
+
+def _grade(
+    exercise: Path, hand_in: Path, seconds: float, picture: Path | None, stopped: Callable[[], bool]
+) -> Graded | None:
+    begin, word = time.monotonic(), f'{secrets.token_hex(16)} '
+    with tempfile.TemporaryDirectory() as folder:
+        command = _pytest('--rootdir', folder, '--hand-in', str(hand_in.resolve()), '--grades', word)
+        if picture is not None:
+            command += ['--picture', str(picture)]
+        process = subprocess.Popen(
+            [*command, str(exercise)],
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors='replace',
+            # What it leaves behind is in its group.
+            start_new_session=True,
+        )
+        output, late = '', False
+        while True:
+            try:
+                output = process.communicate(timeout=POLL)[0]
+                break
+            except subprocess.TimeoutExpired:
+                late = time.monotonic() - begin > seconds
+                if late or stopped():
+                    _end_group(process)
+        _end_group(process)
+    if stopped() and not late and process.returncode not in (0, 1):
+        return None
+    grades: dict[str, dict[str, Any]] = {}
+    for line in output.splitlines():
+        if line.startswith(word):
+            one = json.loads(line.removeprefix(word))
+            grades[one['test']] = one
+    error = ''
+    if late:
+        error = f'not graded to the end: it took longer than {seconds:g} s'
+    elif process.returncode not in (0, 1) or not grades:
+        error = f'not graded to the end: pytest ended with {process.returncode}'
+    took = time.monotonic() - begin
+    return Graded(hand_in=hand_in, grades=tuple(grades.values()), seconds=took, error=error)
+
+
+def _end_group(process: subprocess.Popen[str]) -> None:
+    """End a process and those that it has started."""
+    if os.name == 'posix':
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    else:
+        process.kill()
 
 
 def table(found: Iterable[Graded]) -> str:

@@ -7,6 +7,7 @@ import json
 import queue
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.grading import student
-from diffdrive_jacobian.grading.answers import shown
+from diffdrive_jacobian.grading.answers import as_numbers, shown
 from diffdrive_jacobian.text import printable
 
 SECONDS = 5.0
@@ -51,8 +52,11 @@ class HandIn:
             raise HandInError(f'there is no file {printable(self.path)}')
         # Isolated: neither the folder nor the variables of whoever grades count.
         command = [sys.executable, '-I', student.__file__, str(self.path.resolve()), str(PROCESSOR)]
+        # Where it finds nothing.
+        self._folder = tempfile.TemporaryDirectory()
         self._process = subprocess.Popen(
             command,
+            cwd=self._folder.name,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -95,7 +99,7 @@ class HandIn:
             raise HandInError(f'{what} has ended the process ({why})')
         try:
             kind, value = json.loads(line)
-        except ValueError:
+        except (ValueError, TypeError, RecursionError):
             self.close()
             raise HandInError(f'{what} has written what is no answer') from None
         return str(kind), value
@@ -144,11 +148,8 @@ class HandIn:
         """
         found = self.call(name, *arguments)
         what = f'{name}({", ".join(map(shown, arguments))})'
-        try:
-            numbers = np.asarray(found, dtype=np.float64)
-        except (TypeError, ValueError):
-            numbers = np.empty(0)
-        if found is None or numbers.shape != shape or not np.isfinite(numbers).all():
+        numbers = as_numbers(found)
+        if numbers is None or numbers.shape != shape or not np.isfinite(numbers).all():
             wanted = f'finite numbers of shape {shape}' if shape else 'a finite number'
             raise HandInError(f'{what} must return {wanted}, got {shown(found)}')
         return numbers
@@ -168,6 +169,7 @@ class HandIn:
         for pipe in (self._process.stdin, self._process.stderr):
             if pipe is not None:
                 pipe.close()
+        self._folder.cleanup()
 
 
 def _needed() -> dict[str, str]:

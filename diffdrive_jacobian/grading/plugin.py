@@ -22,7 +22,11 @@ class SavePicture(Protocol):
     """What the fixture `save_picture` is."""
 
     def __call__(self, figure: Any) -> None:
-        """Save a figure where --pictures says, under the name of the hand-in."""
+        """Save a figure where --picture says."""
+
+
+LATE = 'not graded in time'
+"""Why a test gave nothing that did not come to its end."""
 
 
 @dataclass
@@ -58,8 +62,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options."""
     group = parser.getgroup('grading', 'diffdrive_jacobian.grading')
     group.addoption('--hand-in', type=Path, metavar='FILE', help='hand-in that the exercise grades')
-    group.addoption('--grades', type=Path, metavar='FILE', help='JSON file to write its points to')
-    group.addoption('--pictures', type=Path, metavar='DIR', help='where to save pictures of the hand-in')
+    group.addoption('--grades', metavar='WORD', help='print points as JSON in lines that begin so')
+    group.addoption('--picture', type=Path, metavar='FILE', help='where to save a picture of the drive')
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -92,14 +96,13 @@ def hand_in(request: pytest.FixtureRequest) -> Iterator[HandIn]:
 
 @pytest.fixture
 def save_picture(request: pytest.FixtureRequest) -> SavePicture:
-    """A function that saves a figure below the folder of --pictures; without it, it does nothing."""
+    """A function that saves a figure as --picture says; without that it does nothing."""
 
     def save(figure: Any) -> None:
-        folder = request.config.getoption('--pictures')
-        if folder is None:
-            return
-        folder.mkdir(parents=True, exist_ok=True)
-        figure.savefig(folder / f'{request.config.getoption("--hand-in").stem}.png')
+        file = request.config.getoption('--picture')
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            figure.savefig(file)
 
     return save
 
@@ -113,8 +116,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
         return
     if report.when != 'call' and report.passed:
         return
-    marker = item.get_closest_marker('points')
-    of = float(marker.args[0]) if marker is not None and marker.args else 1.0
+    of = _points(item)
     reason = ''
     if report.skipped:
         of, reason = 0.0, f'not graded: {call.excinfo.value if call.excinfo else "skipped"}'
@@ -123,11 +125,36 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
         text = str(error).strip().partition('\n')[0]
         own = isinstance(error, (AssertionError, pytest.fail.Exception))
         reason = text if own else f'{type(error).__name__}: {text}'
-    doc = getattr(getattr(item, 'function', None), '__doc__', None) or item.name
-    task = doc.strip().partition('\n')[0].rstrip('.')
-    name = item.name.removeprefix('test_')
     given = of if report.passed else 0.0
-    item.config.stash[REPORT].grades.append(Grade(name, task, given, of, reason))
+    grade = Grade(*_named(item), given, of, reason)
+    item.config.stash[REPORT].grades.append(grade)
+    _tell(item.config, asdict(grade))
+
+
+def _points(item: pytest.Item) -> float:
+    marker = item.get_closest_marker('points')
+    return float(marker.args[0]) if marker is not None and marker.args else 1.0
+
+
+def _named(item: pytest.Item) -> tuple[str, str]:
+    """Return the name and the task of a test."""
+    doc = getattr(getattr(item, 'function', None), '__doc__', None) or item.name
+    return item.name.removeprefix('test_'), doc.strip().partition('\n')[0].rstrip('.')
+
+
+def _tell(config: pytest.Config, grade: dict[str, Any]) -> None:
+    """Tell `grade_hand_ins` a grade, by the standard output: a hand-in cannot write to that."""
+    word = config.getoption('--grades')
+    if word is not None:
+        config.get_terminal_writer().line(f'\n{word}{json.dumps(grade)}')
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Tell what can be given, before a hand-in takes too long."""
+    for item in items:
+        if 'hand_in' in getattr(item, 'fixturenames', ()):
+            name, task = _named(item)
+            _tell(config, asdict(Grade(name, task, 0.0, _points(item), LATE)))
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
@@ -140,11 +167,3 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
     for one in report.grades:
         reason = f': {one.reason}' if one.reason else ''
         terminalreporter.line(f'{one.points:g}/{one.of:g}  {one.task}{reason}')
-
-
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Write the points for `grade_hand_ins`."""
-    path = session.config.getoption('--grades')
-    if path is not None:
-        grades = session.config.stash[REPORT].grades
-        path.write_text(json.dumps([asdict(one) for one in grades]), encoding='utf-8')

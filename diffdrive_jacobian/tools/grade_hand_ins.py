@@ -48,7 +48,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         stopped=lambda: signals.count > 0,
     )
     if csv is not None:
-        _output.write(csv, table(found).encode(), replace=options.force)
+        _output.write(csv, table(found).encode(errors='backslashreplace'), replace=options.force)
         _output.say(csv)
     _output.check(signals, f'{len(found)} of {len(options.hand_ins)} hand-ins were graded')
     return FAILED if any(one.error for one in found) else DONE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import re
 import subprocess
 import sys
@@ -109,12 +110,48 @@ def test_a_table_has_points_and_reasons_that_no_spreadsheet_obeys(tmp_path):
     assert '3 of 3' in ended.out
 
 
-def test_a_hand_in_that_is_not_graded_in_time_is_an_error_of_its_own(tmp_path):
-    (tmp_path / 'slow.py').write_text('import time\ndef test_slow(hand_in): time.sleep(60)\n')
-    (tmp_path / 'anna.py').write_text('')
-    ended = run('grade_hand_ins', tmp_path / 'slow.py', tmp_path / 'anna.py', '--timeout', 3)
+LATE = """
+import time, pytest
+
+@pytest.mark.points(2)
+def test_quick(hand_in): hand_in.call('f')
+
+@pytest.mark.points(3)
+def test_slow(hand_in): time.sleep(60)
+"""
+
+
+def test_what_was_earned_before_the_time_was_over_counts(tmp_path):
+    exercise = tmp_path / 'late.py'
+    exercise.write_text(LATE)
+    ended, (row,) = grade(exercise, tmp_path, 'def f(): pass\n', options=('--timeout', 4))
     assert ended.code == 1
-    assert 'not graded: it took longer than 3 s' in ended.out
+    assert (row['points'], row['of'], row['quick'], row['slow']) == ('2', '5', '2', '0')
+    assert 'not graded in time' in row['reasons']
+    assert 'took longer than 4 s' in row['reasons']
+
+
+def test_one_hand_in_harms_no_other_and_no_file(tmp_path):
+    """Names that are no UTF-8, texts that cannot be written, and hand-ins of the same name."""
+    exercise = tmp_path / 'exercise.py'
+    exercise.write_text(EXERCISE)
+    right = 'def twice(a): return 2 * a\ndef thrice(a): return 3 * a\n'
+    files = [os.fsencode(tmp_path) + b'/bad\xff.py']
+    files += [os.fsencode(tmp_path / folder / 'mine.py') for folder in ('anna', 'bert')]
+    for file, source in zip(
+        files, ('def twice(a): raise ValueError("\\ud800")', right, right), strict=True
+    ):
+        os.makedirs(os.path.dirname(file), exist_ok=True)
+        with open(file, 'w') as opened:
+            opened.write(source)
+    table, pictures = tmp_path / 'points.csv', tmp_path / 'pictures'
+    names = map(os.fsdecode, files)
+    options = ('--csv', table, '--pictures', pictures)
+    ended = run('grade_hand_ins', exercise, *names, *options)
+    assert (ended.code, ended.err) == (0, '')
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert [row['points'] for row in rows] == ['0', '3', '3']
+    assert sorted(one.name for one in pictures.iterdir()) == ['2_anna_mine.png', '3_bert_mine.png']
 
 
 def test_mistakes_of_the_lecturer_are_named(tmp_path):
