@@ -138,6 +138,10 @@ COMMAND_RATE, COMMAND_BURST = 100.0, 200.0
 """Commands of a page per second, and at once. A page that sends more is disconnected."""
 MAX_STRANGERS = 32
 """Largest number of connections at once without a websocket, and of those that wait to be accepted."""
+GUESTS_TIMES = 12
+"""How many times more of guests: a room opens the page at once, each browser by six connections."""
+NOTICES, NOTICE_PERIOD = 5, 2.0
+"""Notices about invalid commands at once, and the time after which there may be a further one (s)."""
 MAX_INVALID = 20
 """Invalid commands after which a page is disconnected."""
 PING_PERIOD = 2.0
@@ -155,16 +159,20 @@ class _Connection(ServerConnection):
     """
 
     def __init__(
-        self, *args: Any, strangers: dict[ServerConnection, asyncio.Transport], **kwargs: Any
+        self,
+        *args: Any,
+        strangers: dict[ServerConnection, asyncio.Transport],
+        times: int,
+        **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        self._strangers = strangers
+        self._strangers, self._times = strangers, times
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         assert isinstance(transport, asyncio.Transport)
         self._strangers[self] = transport
-        if len(self._strangers) > MAX_STRANGERS:
+        if len(self._strangers) > self._times * MAX_STRANGERS:
             # A browser has sent its request by now: the oldest one is none.
             oldest = next(iter(self._strangers))
             self._strangers.pop(oldest).abort()
@@ -179,7 +187,8 @@ class _Door:
 
     def __init__(self, listening: socket.socket, access: Access, most: int, period: float) -> None:
         self.socket, self.access, self.most, self.period = listening, access, most, period
-        self.may_steer = True
+        self.may_steer, self.times = True, 1
+        self.notices = TokenBucket(NOTICES, NOTICE_PERIOD)
         self.strangers: dict[ServerConnection, asyncio.Transport] = {}
 
 
@@ -220,7 +229,7 @@ class LiveServer:
         door = _Door(listening, Access([host]), MAX_GUESTS, GUEST_PERIOD)
         # Nothing opens it in a browser.
         door.access.ticket = ''
-        door.may_steer = share.control
+        door.may_steer, door.times = share.control, GUESTS_TIMES
         self._doors.append(door)
         self.shared_url = f'http://{host}:{self.port}/{door.access.token}/'
         # It is for the page of this machine, but guests know it anyway.
@@ -271,11 +280,11 @@ class LiveServer:
 
     async def _listen(self, door: _Door, logger: logging.Logger) -> Server:
         # Typed as a class, but any factory does.
-        factory: Any = partial(_Connection, strangers=door.strangers)
+        factory: Any = partial(_Connection, strangers=door.strangers, times=door.times)
         server: Server = await serve(
             partial(self._handle, door),
             sock=door.socket,
-            backlog=MAX_STRANGERS,
+            backlog=door.times * MAX_STRANGERS,
             create_connection=factory,
             process_request=partial(self._answer, door),
             compression=None,
@@ -306,7 +315,11 @@ class LiveServer:
             return None
         if name not in self._files:
             return _response(HTTPStatus.NOT_FOUND, 'text/plain', b'there is no such file\n')
-        return _response(HTTPStatus.OK, *self._files[name])
+        response = _response(HTTPStatus.OK, *self._files[name])
+        if door is not self._doors[0]:
+            # Browsers ignore it without TLS, and complain.
+            del response.headers['Cross-Origin-Opener-Policy']
+        return response
 
     async def _handle(self, door: _Door, connection: ServerConnection) -> None:
         if len(connection.server.connections) > door.most:
@@ -357,7 +370,8 @@ class LiveServer:
                 if invalid >= MAX_INVALID:
                     await connection.close(POLICY_VIOLATION, f'{invalid} invalid commands')
                     return
-                self._session.notify(f'command refused: {error}', 'error')
+                if door.notices.permits(time.monotonic()):
+                    self._session.notify(f'command refused: {error}', 'error')
                 continue
             if not self._session.put(page, command):
                 self._session.notify('too many commands are waiting: this one was dropped', 'warning')

@@ -39,7 +39,7 @@ class Doors:
         self.port = self.server.port
         door = self.server._doors[-1]
         self.host, self.token = (GUESTS if share else '127.0.0.1'), door.access.token
-        self.most = door.most
+        self.most, self.times = door.most, door.times
 
     def close(self):
         self.server.close()
@@ -235,7 +235,7 @@ def test_guests_look_and_whoever_steers_is_disconnected(guests):
 def test_guests_cannot_keep_the_page_of_this_machine_from_its_owner(guests, monkeypatch):
     monkeypatch.setattr(live_server, 'MAX_STRANGERS', 4)
     with contextlib.ExitStack() as stack:
-        for _ in range(12):
+        for _ in range(60):
             stack.enter_context(socket.create_connection((GUESTS, guests.port), timeout=20))
         guests.host, guests.token = '127.0.0.1', guests.server.access.token
         with page(guests) as inside:
@@ -291,11 +291,12 @@ def test_malformed_commands_are_refused_and_then_disconnect(server):
         while 'notices' not in (frame := json.loads(bad.recv(timeout=20))):
             pass
         assert frame['notices'][0]['text'].startswith('command refused: a command must be JSON')
-        # Not one more: the server would close while this page sends.
+        # Not one more: the server would close while this page sends. Not each is a notice for all.
         for _ in range(MAX_INVALID - 1):
             bad.send(b'\x00\xff')
         assert closed(bad) == 1008
     assert session_of(server).take_commands() == []
+    assert len(session_of(server).notices_after(0)) == live_server.NOTICES
 
 
 def test_large_messages_and_too_many_pages_are_disconnected(server):
@@ -333,7 +334,7 @@ def test_connections_that_ask_for_nothing_do_not_use_up_descriptors(monkeypatch,
     with page(server) as first, contextlib.ExitStack() as stack:
         idle = [
             stack.enter_context(socket.create_connection((server.host, server.port), timeout=20))
-            for _ in range(20)
+            for _ in range(16 * server.times + 4)
         ]
         assert get(server, f'/{server.token}/')[0] == 200
         # Those that the server has disconnected can be read.

@@ -3,10 +3,12 @@
 import { byId, element, math, plain } from './dom.js';
 
 const KEY = 'projector';
-const SHARES = [0, 0.5, 1];
+const SHARES = [0, 0.25, 1];
 
 export class Presets {
   constructor(model, send, onChange) {
+    /** The values that were found first: one must come back to them. */
+    this.first = new Map();
     Object.assign(this, { model, send, onChange, shown: '' });
     byId('projector').addEventListener('click', () => {
       try { localStorage.setItem(KEY, this.on ? '' : '1'); } catch { /* It is not kept. */ }
@@ -40,10 +42,13 @@ export class Presets {
     this.shown = layout;
     byId('choices').replaceChildren(
       ...laws.map((row) => this.row(row, row.choices.map((name) => [name, name]))),
-      ...gains.map((row) => this.row(row, SHARES.map((share) => {
-        const value = Number((row.low + share * (row.high - row.low)).toPrecision(2));
-        return [value, plain(value)];
-      }))),
+      ...gains.map((row) => {
+        const id = `${robot.name} ${row.key}`;
+        if (!this.first.has(id)) this.first.set(id, row.value);
+        const values = SHARES.map((share) => Number((row.low + share * (row.high - row.low)).toPrecision(2)));
+        const all = [...new Set([...values, this.first.get(id)])].sort((a, b) => a - b);
+        return this.row(row, all.map((value) => [value, plain(value)]));
+      }),
     );
   }
 
