@@ -2,7 +2,7 @@
 
 How likely each of the hypotheses is, and what the parameters are then, follows from the gradient and
 the information of its change at the estimate. The result is the mean of all. Source:
-doc/mathematics.md, "Consistency".
+doc/moments.md, "Consistency".
 """
 
 from __future__ import annotations

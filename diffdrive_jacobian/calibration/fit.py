@@ -1,7 +1,7 @@
 """Maximum likelihood estimate of the multipliers from wheel angles and poses of a reference.
 
 All poses of the body and all parameters are estimated together by Gauss-Newton steps, the noise by
-restricted maximum likelihood. Source: doc/mathematics.md, "Calibration".
+restricted maximum likelihood. Source: doc/moments.md, "Calibration".
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ parameters. The residuals
     e_i + x_(i+1) - A_i x_i - D_i y   of the motion between two poses, with the covariance k Q_i
     z_i - J x_i - M y                 of a pose that the reference observes, with the covariance R_i
 
-are Gaussian and independent. Source: doc/mathematics.md, "Calibration".
+are Gaussian and independent. Source: doc/moments.md, "Calibration".
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Motion of the body between two times from the angles of the wheels, and its Jacobian.
 
-Source: doc/mathematics.md, "Calibration". Poses are `[x, y, theta]` (m, m, rad). The multipliers are
+Source: doc/moments.md, "Calibration". Poses are `[x, y, theta]` (m, m, rad). The multipliers are
 ordered left wheel radius, right wheel radius, wheel separation, as the parameters of `wheel_bridge`
 and of diff_drive_controller. Angles of the wheels are ordered right, left.
 """

@@ -1,6 +1,6 @@
 """What a robot that takes time to stop means for those who stop it, in words.
 
-Source: doc/mathematics.md, "Acceleration, lag and delay".
+Source: doc/moments.md, "Acceleration, lag and delay".
 """
 
 from __future__ import annotations

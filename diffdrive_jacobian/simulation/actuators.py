@@ -15,7 +15,7 @@ A commanded twist `u = [v, omega]` passes
 
 So v and omega are `a + b t + c exp(-t / tau)` in each piece of time (`speeds`).
 
-Source: doc/mathematics.md, "Acceleration, lag and delay".
+Source: doc/moments.md, "Acceleration, lag and delay".
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ now to rest,
 Here u(0) is measured by the odometry, and u_d is that of the transition which the robot really makes:
 the slower one of v and omega also stretches the other one.
 
-Source: doc/mathematics.md, "Acceleration, lag and delay".
+Source: doc/moments.md, "Acceleration, lag and delay".
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ the frame of the reported pose. Notation: `x = i omega t`, `m = ww t / 2`, `alph
 `beta = vw t`, `h = exp(i psi)`, with the entries vv, vw, ww of W. They are a power series in time, and
 longer arcs are halved. For the arcs between two messages the first terms are written out.
 
-Source: doc/mathematics.md, "Odometry covariance".
+Source: doc/moments.md, "Odometry covariance".
 """
 
 from __future__ import annotations

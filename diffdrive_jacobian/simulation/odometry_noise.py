@@ -7,7 +7,7 @@ each independently. The covariance of the pose is the integral along the exact a
 
 It is right while the standard deviation of the heading is small, see `exact_moments`.
 
-Source: doc/mathematics.md, "Odometry covariance"; the noise model is that of Siegwart, Nourbakhsh,
+Source: doc/moments.md, "Odometry covariance"; the noise model is that of Siegwart, Nourbakhsh,
 Scaramuzza, *Introduction to Autonomous Mobile Robots*, 5.2.4.
 """
 

@@ -4,7 +4,7 @@ It is the projection of the ellipsoid `xi^T covariance^-1 xi <= level` onto the 
 `xi = log(pose^-1 q)` about the reported pose. Covariance and level are those of runs of the noise model
 along the reported path, drawn with a fixed seed, of which 95 % are within.
 
-Sources: doc/mathematics.md, "Odometry covariance"; Long, Wolfe, Mashner and Chirikjian, "The banana
+Sources: doc/moments.md, "Odometry covariance"; Long, Wolfe, Mashner and Chirikjian, "The banana
 distribution is Gaussian", 2012; Barfoot and Furgale, "Associating uncertainty with three-dimensional
 poses for use in estimation problems", 2014.
 """

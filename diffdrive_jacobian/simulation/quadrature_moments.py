@@ -6,7 +6,7 @@ heading, and `u = exp(i psi)`, the error gamma of the position obeys
     d gamma = z ((v + i vw/2) u - v) dt + z u dB_v
 
 Its expectations are integrals over t, by Gauss-Legendre quadrature. The motion is split where a wheel
-changes its direction. Source: doc/mathematics.md, "Acceleration, lag and delay".
+changes its direction. Source: doc/moments.md, "Acceleration, lag and delay".
 """
 
 from __future__ import annotations

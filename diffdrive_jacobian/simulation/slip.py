@@ -10,7 +10,7 @@ with v its rim speed, t the time that is left of the cell, V the variance of the
 in it, and `xi a` what has been slipped. So the state at a time does not depend, to the last bit, on when
 it is computed. Cells of a command that is held for longer than `HOLD` become wider.
 
-Sources: doc/mathematics.md, "Slip"; Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as
+Sources: doc/moments.md, "Slip"; Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as
 1, 2, 3", 2011.
 """
 
