@@ -172,6 +172,8 @@ def _grade(
         process = subprocess.Popen(
             [*command, str(exercise)],
             cwd=folder,
+            # What is ended at once leaves its folders here.
+            env={**os.environ, 'TMPDIR': folder},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

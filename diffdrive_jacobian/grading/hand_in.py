@@ -102,6 +102,9 @@ class HandIn:
         except (ValueError, TypeError, RecursionError):
             self.close()
             raise HandInError(f'{what} has written what is no answer') from None
+        if kind == 'ready' and not isinstance(value, list):
+            self.close()
+            raise HandInError(f'{what} has written what is no answer')
         return str(kind), value
 
     def has(self, name: str) -> bool:
@@ -138,7 +141,10 @@ class HandIn:
         kind, value = self._answer(what, self._seconds)
         if kind != 'value':
             raise HandInError(f'{what}: {value}')
-        return _received(value)
+        try:
+            return _received(value)
+        except (KeyError, TypeError, ValueError, MemoryError, RecursionError):
+            raise HandInError(f'{what} has written what is no answer') from None
 
     def array(self, name: str, *arguments: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
         """Call a function that must return finite numbers of a shape; the rest as for `call`.

@@ -45,6 +45,27 @@ def test_arguments_and_results_are_numbers_texts_lists_and_arrays(start):
     np.testing.assert_array_equal(hand_in.array('same', [1, 2], shape=(2,)), [1.0, 2.0])
 
 
+STUDENTS = {
+    'a dataclass': b'from dataclasses import dataclass\n@dataclass\nclass A:\n    r: float\ndef f(): return A(2.0).r\n',
+    'annotations as texts': b'from __future__ import annotations\nfrom dataclasses import dataclass\n'
+    b'@dataclass\nclass A:\n    r: float\ndef f(): return A(2.0).r\n',
+    'a mark of the encoding': b'\xef\xbb\xbfdef f(): return 2.0\r\n',
+    'Latin-1': b'# coding: latin-1\nl\xe4nge = 2.0\ndef f(): return l\xe4nge\n',
+    'a part of a program': b'def f(): return 2.0\nif __name__ == "__main__":\n    f(1)\n',
+    'masked arrays': b'import numpy as np\ndef f(): return np.ma.array([2.0]).sum()\n',
+}
+"""What students write, and their editors."""
+
+
+@pytest.mark.parametrize('source', STUDENTS.values(), ids=STUDENTS)
+def test_what_students_write_runs(tmp_path, source):
+    file = tmp_path / 'anna.py'
+    file.write_bytes(source)
+    hand_in = HandIn(file, seconds=20.0)
+    assert hand_in.call('f') == 2.0
+    hand_in.close()
+
+
 REFUSED = {
     'return open("/etc/passwd").read()': r'opens or changes a file \(line 3\)',
     'import io; return io.FileIO("/etc/passwd")': 'opens or changes a file',
@@ -61,6 +82,7 @@ REFUSED = {
     'import sys; sys.modules["_signal"].raise_signal(9)': r'ended the process \(signal 9\)',
     'import diffdrive_jacobian': 'imports diffdrive_jacobian, and may import numpy',
     'import multiprocessing': 'imports multiprocessing',
+    'from math import sinn': r"ImportError: cannot import name 'sinn' from 'math'.* \(line 3\)",
     'import sys; sys.modules["__main__"].raise_fence.__code__ = f.__code__': 'changes how Python works',
     'return input("?")': 'asks for input, which nobody answers',
     'raise SystemExit': 'SystemExit',
@@ -72,6 +94,7 @@ REFUSED = {
     'raise ValueError("\\ud800")': 'ValueError',
     'while True: pass': 'took longer than 1 s: is there a loop without end',
     'import sys; sys._getframe(1).f_locals["answers"].write("[1]\\n" * 9)': 'written what is no answer',
+    'import sys; sys._getframe(1).f_locals["answers"].write(\'["value", {"a": 1}]\\n\')': 'no answer',
 }
 
 
