@@ -46,7 +46,8 @@ def test_arguments_and_results_are_numbers_texts_lists_and_arrays(start):
 
 
 STUDENTS = {
-    'a dataclass': b'from dataclasses import dataclass\n@dataclass\nclass A:\n    r: float\ndef f(): return A(2.0).r\n',
+    'a dataclass': b'from dataclasses import dataclass\n'
+    b'@dataclass\nclass A:\n    r: float\ndef f(): return A(2.0).r\n',
     'annotations as texts': b'from __future__ import annotations\nfrom dataclasses import dataclass\n'
     b'@dataclass\nclass A:\n    r: float\ndef f(): return A(2.0).r\n',
     'a mark of the encoding': b'\xef\xbb\xbfdef f(): return 2.0\r\n',
