@@ -8,34 +8,34 @@ const RATE = 30;
 export class Capture {
   constructor(map, model, notices) {
     // The map has no ground of its own.
-    Object.assign(this, { map, model, notices, copy: document.createElement('canvas'), recorder: null });
+    Object.assign(this, { map, model, notices, recorder: null });
     byId('picture').addEventListener('click', () => this.picture());
     byId('film').addEventListener('click', () => { if (this.recorder) this.recorder.stop(); else this.film(); });
   }
 
   /** Take what the map shows, if a film is made; to be called when it was drawn. */
   drawn() {
-    if (this.recorder) this.take();
+    if (this.recorder) this.take(this.frame);
   }
 
-  take() {
-    const { map, copy } = this, context = copy.getContext('2d');
+  canvas(width, height) {
+    return Object.assign(document.createElement('canvas'), { width, height });
+  }
+
+  take(copy) {
+    const { map } = this, context = copy.getContext('2d');
     context.fillStyle = getComputedStyle(map.parentElement).backgroundColor;
     context.fillRect(0, 0, copy.width, copy.height);
-    context.drawImage(map, 0, 0, copy.width, copy.height);
-  }
-
-  resize() {
-    // Films have even sizes.
-    this.copy.width = this.map.width - (this.map.width % 2);
-    this.copy.height = this.map.height - (this.map.height % 2);
+    // A film keeps its size and the map its shape when the page is laid out anew.
+    const scale = Math.min(copy.width / map.width, copy.height / map.height);
+    const [width, height] = [scale * map.width, scale * map.height];
+    context.drawImage(map, (copy.width - width) / 2, (copy.height - height) / 2, width, height);
   }
 
   picture() {
-    // The size of a film must not change.
-    if (!this.recorder) this.resize();
-    this.take();
-    this.copy.toBlob((blob) => this.save(blob, 'png'), 'image/png');
+    const still = this.canvas(this.map.width, this.map.height);
+    this.take(still);
+    still.toBlob((blob) => this.save(blob, 'png'), 'image/png');
   }
 
   film() {
@@ -44,10 +44,11 @@ export class Capture {
       this.notices.show('error', 'this browser cannot make films: plot_run --film makes one of a bag');
       return;
     }
-    this.resize();
-    this.take();
+    // Films have even sizes.
+    this.frame = this.canvas(this.map.width & ~1, this.map.height & ~1);
+    this.take(this.frame);
     const parts = [];
-    const recorder = new MediaRecorder(this.copy.captureStream(RATE), { mimeType, videoBitsPerSecond: 4e6 });
+    const recorder = new MediaRecorder(this.frame.captureStream(RATE), { mimeType, videoBitsPerSecond: 4e6 });
     recorder.addEventListener('dataavailable', (event) => parts.push(event.data));
     recorder.addEventListener('stop', () => {
       this.recorder = null;
