@@ -1,9 +1,24 @@
+# Copyright 2026 The diffdrive_jacobian developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The layers: imports go down only, the pure ones need NumPy alone, and only the tools print."""
 
 from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -108,3 +123,20 @@ def test_only_the_tools_print():
             if printing or (isinstance(node, ast.Attribute) and node.attr in ('stdout', 'stderr')):
                 loud.add(place(path))
     assert loud == {'tools', 'grading'}
+
+
+def test_every_source_says_whose_it_is_and_under_which_licence():
+    def header(path):
+        # In C and C++ behind //, as half of the address is. The year is that of the file.
+        first = path.read_text(encoding='utf-8').replace('//', '#').partition('\n\n')[0]
+        return re.sub(r' 20\d\d ', ' ', first)
+
+    folders = (ROOT, Path(__file__).parents[1])
+    sources = [
+        path
+        for folder in folders
+        for ending in ('py', 'c', 'cpp')
+        for path in folder.rglob(f'*.{ending}')
+    ]
+    assert len(sources) > 500
+    assert [path for path in sources if header(path) != header(Path(__file__))] == []
