@@ -39,8 +39,8 @@ from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 TEXTS = {name: path.read_text() for name, path in PAGES.items()}
 BLOCKS = [block for text in TEXTS.values() for block in blocks(text)]
 SKIPPED = [block for block in BLOCKS if 'skip' in block.notes]
-MOST_SKIPPED = 9
-"""Blocks in all pages that no test runs: those that need pip, a ROS installation, a network."""
+MOST_SKIPPED = 10
+"""Blocks in all pages that no test runs: those that need pip, a ROS installation, a network, or run tests."""
 NODES = {'virtual_robot': VirtualRobot, 'go_to_goal': GoToGoal, 'wheel_bridge': WheelBridge}
 TOOLS = {
     one.name
@@ -250,6 +250,29 @@ def anchors(text):
     """Return the anchors of the headings of a page, as GitHub makes them."""
     headings = re.findall(r'^#+ (.*)$', without_code(text), re.MULTILINE)
     return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
+
+
+LATEX = """
+    begin end left right dot frac tfrac sqrt text mathrm mathcal mathbb mathrel quad qquad
+    alpha beta gamma delta Delta theta lambda nu xi pi rho phi Phi psi omega
+    cos sin cot exp log min det sum int partial cdot cdots vdots times sim le lt in langle rangle
+    rightarrow Rightarrow
+"""
+# Forges do not know each command: not operatorname, for example.
+
+
+def test_equations_are_whole_and_of_known_commands():
+    equation = re.compile(r'^ *```math\n(.*?)^ *```$', re.MULTILINE | re.DOTALL)
+    equations = [found for text in TEXTS.values() for found in equation.findall(text)]
+    assert len(equations) > 80
+    for text in equations:
+        assert set(re.findall(r'\\([A-Za-z]+)', text)) <= set(LATEX.split()), text
+        for opens, closes in (('begin', 'end'), ('left', 'right')):
+            first, last = (re.findall(rf'\\{word}\b({{\w+}})?', text) for word in (opens, closes))
+            assert sorted(first) == sorted(last), text
+        while (less := re.sub(r'{[^{}]*}', '', text)) != text:
+            text = less
+        assert not {'{', '}'} & set(text), text
 
 
 def test_links_lead_somewhere():
