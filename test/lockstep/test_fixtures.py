@@ -48,7 +48,8 @@ def run(pytester, monkeypatch):
     def run_tests(tests, *options, **outcomes):
         result = run_inner(pytester, tests, *options)
         result.assert_outcomes(**outcomes)
-        text = result.stdout.str()
+        # Under `colcon test` the summary of warnings goes to standard error.
+        text = result.stdout.str() + result.stderr.str()
         assert 'INTERNALERROR' not in text
         return text
 
