@@ -67,8 +67,9 @@ class RunSummary:
         text = f'{self.outcome} {when} {self.seconds:.1f} s, {self.length:.2f} m driven'
         if np.isnan(self.true_distance):
             return text
-        # The outcome is the opinion of the odometry.
-        return f'by odometry {text}; truly {self.true_distance:.2f} m away'
+        # An arrival is the opinion of the odometry.
+        opinion = 'by odometry ' if self.outcome == 'arrived' else ''
+        return f'{opinion}{text}; truly {self.true_distance:.2f} m away'
 
 
 def summary(one: Timeline) -> RunSummary:
@@ -112,8 +113,8 @@ def table_of(names: Sequence[str], summaries: Sequence[RunSummary]) -> list[str]
         'late': [_with_unit(one.late, '.1f', 's') for one in summaries],
         'max across': [_with_unit(one.across, '.3f', 'm') for one in summaries],
         'max bearing error': [_with_unit(one.bearing_error, '.2f', 'rad') for one in summaries],
-        'max v': [f'{one.v:.2f} m/s' for one in summaries],
-        'max omega': [f'{one.omega:.2f} rad/s' for one in summaries],
+        'max v': [_with_unit(one.v, '.2f', 'm/s') for one in summaries],
+        'max omega': [_with_unit(one.omega, '.2f', 'rad/s') for one in summaries],
     }
     shown = [[name, *cells] for name, cells in columns.items() if any(cells)]
     widths = [max(map(len, column)) for column in shown]

@@ -158,6 +158,8 @@ def test_the_true_distance_says_whose_opinion_the_outcome_is(tmp_path):
     assert found.true_distance == pytest.approx(0.1)
     assert found.described == 'by odometry arrived after 1.0 s, 0.50 m driven; truly 0.10 m away'
     assert 'truly' in table_of(['run'], [found])[0]
+    found = summed(tmp_path / 'late', (10.0, ONE), (10.0, status(2)), (11.0, status(5)), truth=truth)
+    assert found.described == 'canceled after 1.0 s, 0.50 m driven; truly 0.10 m away'
 
 
 def test_the_table_has_the_columns_that_a_run_has(tmp_path):
@@ -173,3 +175,5 @@ def test_the_table_has_the_columns_that_a_run_has(tmp_path):
         ['b', 'not arrived', '4.0 s', '1.99 m', '0.000 m', '0.50 m/s', '0.00 rad/s'],
     ]
     assert lines[1].rindex('m/s') == lines[2].rindex('m/s')
+    # A goal after the last odometry: nothing was driven to it.
+    assert 'nan' not in ''.join(table_of(['late'], [summed(tmp_path / 'late', (20.0, ONE))]))

@@ -81,7 +81,7 @@ def installed() -> Iterator[str]:
     """
     with tempfile.TemporaryDirectory() as folder:
         venv.create(folder, symlinks=True)
-        site = Path(sysconfig.get_path('purelib', 'venv', {'base': folder}))
+        site = Path(sysconfig.get_path('purelib', 'posix_prefix', {'base': folder}))
         shutil.copytree(PACKAGE, site / PACKAGE.name, ignore=shutil.ignore_patterns('__pycache__'))
         compileall.compile_dir(site, quiet=1)
         # The finders of editable installations there are not used: only their own directory's are.
