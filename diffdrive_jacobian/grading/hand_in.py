@@ -49,7 +49,7 @@ class HandInError(DiffdriveError, AssertionError):
 
 
 class HandIn:
-    """The functions of a file, called in a process that can open no file and is ended in time."""
+    """The functions of a file, called in a process that may open no file and is ended in time."""
 
     def __init__(self, path: str | Path, *, seconds: float = SECONDS) -> None:
         """Start the process.

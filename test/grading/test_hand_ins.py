@@ -140,6 +140,11 @@ def test_nothing_is_left_behind(start):
     assert not Path(folder).exists()
 
 
+@pytest.mark.parametrize('end', ['exit()', 'raise SystemExit("done")'])
+def test_a_program_that_ends_itself_has_its_functions(start, end):
+    assert start(f'def f(): return 1\n{end}\ndef g(): pass\n').call('f') == 1
+
+
 BROKEN = {
     'a b': r'anna.py cannot be run: SyntaxError: invalid syntax \(line 1\)',
     '1 / 0': r'cannot be run: ZeroDivisionError: division by zero \(line 1\)',

@@ -146,9 +146,11 @@ def test_a_slider_changes_the_gain_and_a_refused_value_goes_back(live):
     browser.until(f'document.querySelector({json.dumps(kp)}).value !== "8"')
     value = browser.evaluate(f'document.querySelector({json.dumps(kp + "[type=text]")}).value')
     field = f'document.querySelector({json.dumps(kp + "[type=text]")})'
-    browser.evaluate(f'({field}.value = "-3", {field}.dispatchEvent(new Event("change")))')
-    browser.until('document.getElementById("notices").innerText.includes("kp refused")')
-    browser.until(f'{field}.value === {json.dumps(value)}')
+    for typed, said in (('-3', 'kp refused'), ('2,5 m', 'must be a number, got "2,5 m"')):
+        change = f'{field}.dispatchEvent(new Event("change"))'
+        browser.evaluate(f'({field}.value = {json.dumps(typed)}, {change})')
+        browser.until(f'document.getElementById("notices").innerText.includes({json.dumps(said)})')
+        browser.until(f'{field}.value === {json.dumps(value)}')
 
 
 def test_a_key_drives_and_letting_go_stops(live):

@@ -39,7 +39,7 @@ const send = (command) => {
 const showFollow = () => byId('follow').setAttribute('aria-pressed', String(view.follow));
 const pointer = new MapPointer(byId('map'), view, drawing, model, send, showFollow);
 const hand = new HandDriving(model, send), chain = new Chain(byId('chain'));
-const settings = new Settings(model, send), transport = new Transport(model, send);
+const settings = new Settings(model, send, notices), transport = new Transport(model, send);
 const strips = new Strips(byId('strips'), model, (time) => transport.seek(time));
 const capture = new Capture(byId('map'), model, notices);
 const presets = new Presets(model, send, () => { drawing.fontSize = presetSize(); changed = true; });

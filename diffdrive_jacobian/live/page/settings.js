@@ -6,9 +6,8 @@ const PERIOD = 120;
 const REST = 900;
 
 export class Settings {
-  constructor(model, send) {
-    this.model = model;
-    this.send = send;
+  constructor(model, send, notices) {
+    Object.assign(this, { model, send, notices });
     this.rows = new Map();
     this.shown = '';
     /** Groups that were opened. */
@@ -89,7 +88,10 @@ export class Settings {
       const value = parseNumber(field.value);
       if (Number.isFinite(value)) this.change(row, value);
       else if (limit && field.value.trim() === '') this.change(row, null);
-      else this.show(true);
+      else {
+        this.notices.show('error', `${row.label} must be a number${limit ? ', or empty for none' : ''}, got "${field.value}"`);
+        this.show(true);
+      }
     });
     field.addEventListener('keydown', (event) => { if (event.key === 'Enter') field.blur(); });
     const set = (value) => {
