@@ -255,8 +255,8 @@ def anchors(text):
 LATEX = """
     begin end left right dot frac tfrac sqrt text mathrm mathcal mathbb mathrel quad qquad
     alpha beta gamma delta Delta theta lambda nu xi pi rho phi Phi psi omega
-    cos sin cot exp log min det sum int partial cdot cdots vdots times sim le lt in langle rangle
-    rightarrow Rightarrow
+    cos sin cot exp log min det sum int partial cdot cdots vdots ddots times sim le lt in langle rangle
+    rightarrow leftarrow Rightarrow overrightarrow mathbf hat max
 """
 # Forges do not know each command: not operatorname, for example.
 
