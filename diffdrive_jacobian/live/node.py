@@ -17,25 +17,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 
-from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.drives.nodes import DISCOVERY_PERIOD as RECORDED_PERIOD
 from diffdrive_jacobian.drives.nodes import add_nodes, in_lockstep, in_real_time, recorder_of
 from diffdrive_jacobian.live.commands import Command, RobotCommand
-from diffdrive_jacobian.live.fleet import PATTERN, Member, members
+from diffdrive_jacobian.live.fleet import PATTERN, Member
 from diffdrive_jacobian.live.live_robot import LiveRobot
 from diffdrive_jacobian.live.pacing import Pacing, control_time
+from diffdrive_jacobian.live.page_drive import PageDrive
 from diffdrive_jacobian.live.robot_state import GoalEnd
 from diffdrive_jacobian.live.server import LiveServer, Ready
 from diffdrive_jacobian.live.session import Session, Share, Snapshot
@@ -44,7 +42,6 @@ from diffdrive_jacobian.messages.codecs import PARAMETER_EVENT, Changes
 from diffdrive_jacobian.messages.names import base_name, full_name, is_named, namespace_of, node_of
 from diffdrive_jacobian.messages.topics import PARAMETER_EVENTS, TOPICS, Selection
 from diffdrive_jacobian.parameters.declaration import ParameterError
-from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.signals import Signals
@@ -259,85 +256,48 @@ def watch_nodes(
                 page.stop()
 
 
-def drive_live(
-    goals: NDArray[np.float64] | Path,
-    *,
-    relative: bool = False,
-    lockstep: bool,
-    isolated: bool,
-    parameters: Mapping[str, Any],
-    robot_parameters: Mapping[str, Any],
-    recording: Recording | None,
-    ros_arguments: Sequence[str],
-    port: int,
-    signals: Signals,
-    ready: Ready,
-    nodes_created: Callable[[Sequence[str]], None],
-    goal_ended: Callable[[GoalEnd], None] | None = None,
-    robots: int = 1,
-    share: Share | None = None,
-) -> None:
-    """Run robot, wheel bridge and controller in this process, with the page, until a signal comes.
-
-    Args:
-        goals: `[x, y, theta]` of goals that are sent when a page is open, shape (n, 3), n may be 0
-            (m, m, rad). Or a path.
-        relative: Whether they are in the body frame of the robot where it is then.
-        lockstep: Whether time is simulated. The page then has pause, step and speed.
-        isolated: Whether no other process can communicate with the nodes.
-        parameters: Parameters of go_to_goal.
-        robot_parameters: Parameters of virtual_robot.
-        recording: Recording of what the nodes publish. The caller must finish it.
-        ros_arguments: ROS arguments of all nodes.
-        port: As for `watch_nodes`.
-        signals: Likewise.
-        ready: Likewise.
-        nodes_created: Receives the fully qualified names of the nodes.
-        goal_ended: Receives the end of each goal.
-        robots: How many robots there are, each with its bridge and its controller.
-        share: As for `watch_nodes`.
+def drive_live(drive: PageDrive) -> None:
+    """Run robots, wheel bridges and controllers in this process, with the page.
 
     Raises:
         UserError: A node cannot run with the parameters or ROS arguments given.
         DriveError: In lockstep, a callback blocks, or simulated time cannot advance.
         OSError: The port is in use.
     """
-    session = Session()
-    stage = in_lockstep(ros_arguments) if lockstep else in_real_time(ros_arguments, isolated=isolated)
-    with closing(LiveServer(session, port, share)) as server, ExitStack() as stack:
-        ready(server)
+    session, arguments, isolated = Session(), drive.ros_arguments, drive.isolated
+    stage = in_lockstep(arguments) if drive.lockstep else in_real_time(arguments, isolated=isolated)
+    with closing(LiveServer(session, drive.port, drive.share)) as server, ExitStack() as stack:
+        drive.ready(server)
         runner = stack.enter_context(stage)
         context = runner.context
-        fleet, names = members(robots), list[str]()
+        fleet, names = drive.fleet, list[str]()
         for one in fleet:
-            of_robot = one.placed(robot_parameters)
-            nodes = add_nodes(runner, parameters, of_robot, namespace=one.namespace)
+            of_robot = one.placed(drive.robot_parameters)
+            nodes = add_nodes(runner, drive.parameters, of_robot, namespace=one.namespace)
             names += [node.get_fully_qualified_name() for node in nodes]
-        nodes_created(names)
-        pacing = Pacing() if lockstep else None
+        drive.nodes_created(names)
+        pacing = Pacing() if drive.lockstep else None
         # The executor of nodes that others can reach leaves the topics to `work`.
-        page = runner.add(
-            lambda: LivePage(session, context, polled=not isolated, pacing=pacing, goal_ended=goal_ended)
-        )
+        how: Any = {'polled': not isolated, 'pacing': pacing, 'goal_ended': drive.goal_ended}
+        page = runner.add(lambda: LivePage(session, context, **how))
         stack.callback(page.stop)
-        selection = Selection(pattern=PATTERN) if robots > 1 else None
-        discover = recorder_of(runner, recording, selection)
-        waiting = [*fleet] if isinstance(goals, Path) or len(goals) else []
+        selection = Selection(pattern=PATTERN) if drive.robots > 1 else None
+        discover = recorder_of(runner, drive.recording, selection)
+        waiting = drive.sends
         since: list[float] = []
 
         def work() -> bool:
+            nonlocal waiting
             discover()
             page.work()
             # Whoever opened the page wants to see the whole drive. What is sent at once after the page
             # has its publishers would not be recorded.
             if waiting and session.watched and all(map(page.is_ready, fleet)):
                 since.append(runner.seconds())
-                if recording is None or since[-1] - since[0] >= RECORDED_AFTER:
-                    for one in waiting:
-                        moved = one.moved(goals, relative=relative)
-                        page.robots[one.namespace].send(moved, relative=relative)
-                    waiting.clear()
-            return signals.count > 0
+                if drive.recording is None or since[-1] - since[0] >= RECORDED_AFTER:
+                    waiting = False
+                    drive.send(page.robots)
+            return drive.signals.count > 0
 
         if pacing is None:
             runner.spin(work)

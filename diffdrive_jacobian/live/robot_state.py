@@ -109,7 +109,7 @@ def poses_of(goals: Goals | Path) -> Goals:
 
 
 class GoalEnd(NamedTuple):
-    """The end of a goal. Poses are `[x, y, theta]`, shape (3,) (m, m, rad)."""
+    """The end of a goal or path. Poses are `[x, y, theta]`, shape (3,) (m, m, rad)."""
 
     robot: str
     """Namespace of the robot, `/` or `/NAME`."""
@@ -123,6 +123,8 @@ class GoalEnd(NamedTuple):
     """Distance from the driven point to the goal by the odometry (m). NaN without odometry."""
     true_distance: float
     """The same by the ground truth (m). NaN: it is not known."""
+    path: bool
+    """Whether it was a path, of which `goal` is the end."""
 
 
 class GoalProgress:
@@ -380,12 +382,13 @@ class RobotState:
         assert ended.goal is not None
         goals = poses_of(ended.goal)
         index = self.goal.index if goals is self.goal.goals else 0
-        goal = goals[-1 if ended.state is GoalState.SUCCEEDED else index]
+        path = isinstance(ended.goal, Path)
+        goal = goals[-1 if path or ended.state is GoalState.SUCCEEDED else index]
         distance, true_distance = (
             math.nan if pose is None else quantities.errors(pose, goal, self.arrival.offset)[0]
             for pose in (self.pose, self.truth)
         )
-        return GoalEnd(self.name, ended.state, goal, self.pose, distance, true_distance)
+        return GoalEnd(self.name, ended.state, goal, self.pose, distance, true_distance, path)
 
     def moved(
         self,

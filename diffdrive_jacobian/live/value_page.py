@@ -18,29 +18,25 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.drives.read_values import as_read
 from diffdrive_jacobian.drives.values import START, World, record
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.live.commands import RobotCommand
-from diffdrive_jacobian.live.fleet import members
 from diffdrive_jacobian.live.pacing import Pacing, control_time
-from diffdrive_jacobian.live.robot_state import GoalEnd
-from diffdrive_jacobian.live.server import LiveServer, Ready
-from diffdrive_jacobian.live.session import Session, Share, Snapshot
+from diffdrive_jacobian.live.page_drive import PageDrive
+from diffdrive_jacobian.live.server import LiveServer
+from diffdrive_jacobian.live.session import Session, Snapshot
 from diffdrive_jacobian.live.steered_robot import COMMAND_LIFE, SteeredRobot
 from diffdrive_jacobian.messages.codecs import Command, Place, Route
 from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
 from diffdrive_jacobian.parameters.declaration import ParameterError
-from diffdrive_jacobian.recording.recording import Recording
-from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.time_units import NANOSECONDS, seconds
 
 PERIOD = 1.0 / 30.0
@@ -222,68 +218,47 @@ class ValuePage:
         self.settle()
 
 
-def drive_live(
-    goals: NDArray[np.float64] | Path,
-    *,
-    relative: bool = False,
-    lockstep: bool,
-    isolated: bool,
-    parameters: Mapping[str, Any],
-    robot_parameters: Mapping[str, Any],
-    recording: Recording | None,
-    ros_arguments: Sequence[str],
-    port: int,
-    signals: Signals,
-    ready: Ready,
-    nodes_created: Callable[[Sequence[str]], None],
-    goal_ended: Callable[[GoalEnd], None] | None = None,
-    robots: int = 1,
-    share: Share | None = None,
-) -> None:
-    """Drive robot, bridge and controller without ROS, with the page, until a signal comes.
-
-    The arguments are those of `live.node.drive_live`. It is always `isolated`.
+def drive_live(drive: PageDrive) -> None:
+    """Drive robots, bridges and controllers without ROS, with the page. They are always isolated.
 
     Raises:
         UserError: The parameters or the ROS arguments are invalid.
         OSError: The port is in use.
     """
-    if not isolated:
+    if not drive.isolated:
         raise UserError('other processes need rclpy, which is not installed')
-    start = START if lockstep else time.time_ns()
-    fleet = members(robots)
+    start = START if drive.lockstep else time.time_ns()
     worlds = [
         World(
-            parameters,
-            one.placed(robot_parameters),
-            ros_arguments,
+            drive.parameters,
+            one.placed(drive.robot_parameters),
+            drive.ros_arguments,
             start,
             namespace=one.namespace,
         )
-        for one in fleet
+        for one in drive.fleet
     ]
-    nodes_created([name for world in worlds for name in world.nodes.values()])
+    drive.nodes_created([name for world in worlds for name in world.nodes.values()])
     session, pacing, numbers = Session(), Pacing(), itertools.count(1)
-    if recording is not None:
+    if drive.recording is not None:
         for world in worlds:
-            record(world, recording, numbers)
-    page = ValuePage(session, worlds, pacing, controlled=lockstep)
+            record(world, drive.recording, numbers)
+    page = ValuePage(session, worlds, pacing, controlled=drive.lockstep)
     for robot in page.robots.values():
-        robot.on_end = goal_ended
-    waiting = [*fleet] if isinstance(goals, Path) or len(goals) else []
-    with closing(LiveServer(session, port, share)) as server:
-        ready(server)
+        robot.on_end = drive.goal_ended
+    waiting = drive.sends
+    with closing(LiveServer(session, drive.port, drive.share)) as server:
+        drive.ready(server)
 
         def work() -> bool:
+            nonlocal waiting
             page.work()
             # Whoever opened the page wants to see the whole drive.
             if waiting and session.watched and all(robot.ready for robot in page.robots.values()):
-                for one in waiting:
-                    moved = one.moved(goals, relative=relative)
-                    page.robots[one.namespace].send(moved, relative=relative)
-                waiting.clear()
+                waiting = False
+                drive.send(page.robots)
                 page.settle()
-            return signals.count > 0
+            return drive.signals.count > 0
 
         while not (work() or pacing.pace(page.seconds, work)):
             page.advance()

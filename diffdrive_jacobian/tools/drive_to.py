@@ -155,18 +155,24 @@ def _drive_with_page(goals: Goals, options: argparse.Namespace, how: dict[str, A
             from diffdrive_jacobian.live.node import drive_live
         else:
             from diffdrive_jacobian.live.value_page import drive_live
+        from diffdrive_jacobian.live.page_drive import PageDrive
+
         drive_live(
-            goals,
-            port=options.port,
-            ready=watch_run.announcing(
-                options,
-                waiting='the drive starts' if given else '',
-                notice=DRIVES if given else watch_run.STEERS,
-            ),
-            nodes_created=lambda names: _cli.warn_of_unused_files(PROGRAM, how['ros_arguments'], names),
-            goal_ended=_print_goal_end,
-            robots=options.robots or 1,
-            **how,
+            PageDrive(
+                goals=goals,
+                port=options.port,
+                ready=watch_run.announcing(
+                    options,
+                    waiting='the drive starts' if given else '',
+                    notice=DRIVES if given else watch_run.STEERS,
+                ),
+                nodes_created=lambda names: _cli.warn_of_unused_files(
+                    PROGRAM, how['ros_arguments'], names
+                ),
+                goal_ended=_print_goal_end,
+                robots=options.robots or 1,
+                **how,
+            )
         )
     return DONE
 
@@ -240,11 +246,12 @@ def _save(recording: Recording, picture: Path | None, *, replace: bool) -> int:
     return code
 
 
-def _describe_distances(distance: float, true_distance: float) -> str:
+def _describe_distances(distance: float, true_distance: float, *, path: bool = False) -> str:
     """Return how far a robot is from its goal (m), in words. A true distance of NaN is not known."""
+    what = 'end of the path' if path else 'goal'
     if math.isnan(true_distance):
-        return f'{distance:.3f} m from the goal'
-    return f'{distance:.3f} m from the goal by odometry, {true_distance:.3f} m by ground truth'
+        return f'{distance:.3f} m from the {what}'
+    return f'{distance:.3f} m from the {what} by odometry, {true_distance:.3f} m by ground truth'
 
 
 def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
@@ -297,7 +304,7 @@ def _reason(outcome: Outcome, timeout: float) -> str:
 
 
 def _print_goal_end(end: GoalEnd) -> None:
-    """Print the end of a goal in one line."""
+    """Print the end of a goal or path in one line."""
     from diffdrive_jacobian.messages.goal_status import GoalState
 
     ends = {
@@ -310,10 +317,11 @@ def _print_goal_end(end: GoalEnd) -> None:
         x, y, theta = end.pose
         where = (
             f'the robot is at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
-            f'{_describe_distances(end.distance, end.true_distance)}'
+            f'{_describe_distances(end.distance, end.true_distance, path=end.path)}'
         )
     robot = '' if end.robot == '/' else f'{end.robot}: '
-    print(f'{robot}goal ({end.goal[0]:g}, {end.goal[1]:g}) {ends[end.state]}: {where}', flush=True)
+    what = 'path to' if end.path else 'goal'
+    print(f'{robot}{what} ({end.goal[0]:g}, {end.goal[1]:g}) {ends[end.state]}: {where}', flush=True)
 
 
 def _parser() -> _cli.Parser:

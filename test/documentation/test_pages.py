@@ -40,7 +40,7 @@ TEXTS = {name: path.read_text() for name, path in PAGES.items()}
 BLOCKS = [block for text in TEXTS.values() for block in blocks(text)]
 SKIPPED = [block for block in BLOCKS if 'skip' in block.notes]
 MOST_SKIPPED = 10
-"""Blocks in all pages that no test runs: those that need pip, a ROS installation, a network, or run tests."""
+"""Blocks in all pages that no test runs: they need pip, a ROS installation, a network, or run tests."""
 NODES = {'virtual_robot': VirtualRobot, 'go_to_goal': GoToGoal, 'wheel_bridge': WheelBridge}
 TOOLS = {
     one.name

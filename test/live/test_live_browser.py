@@ -33,6 +33,7 @@ from support import processes
 from support.processes import open_world
 
 from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.live.page_drive import PageDrive
 from diffdrive_jacobian.live.session import Share
 from diffdrive_jacobian.live.value_page import drive_live
 from diffdrive_jacobian.signals import Signals
@@ -359,9 +360,8 @@ def shared():
     how = {'lockstep': True, 'isolated': True, 'recording': None, 'ros_arguments': (), 'port': 0}
     how |= {'parameters': {'kp': 2.0}, 'robot_parameters': {}, 'nodes_created': lambda names: None}
     arguments = {**how, 'signals': signals, 'ready': servers.append, 'robots': 2}
-    goals = np.array([[50.0, 0.0, 0.0]])
-    share = Share('127.0.0.2')
-    driving = threading.Thread(target=lambda: drive_live(goals, **arguments, share=share))
+    arguments |= {'goals': np.array([[50.0, 0.0, 0.0]]), 'share': Share('127.0.0.2')}
+    driving = threading.Thread(target=drive_live, args=[PageDrive(**arguments)])
     driving.start()
     try:
         until(lambda: servers, 'the server runs')
