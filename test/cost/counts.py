@@ -30,7 +30,10 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-PACKAGE = os.sep + 'diffdrive_jacobian' + os.sep
+import diffdrive_jacobian
+
+# Its folder, not its name: that of the clone is often the same, and environments are below it.
+PACKAGE = os.path.dirname(diffdrive_jacobian.__file__) + os.sep
 QUIET = ['--ros-args', '--log-level', 'error']
 
 
@@ -78,7 +81,7 @@ def per_message(count: Callable[[str], Counter[Any]], messages: int) -> dict[str
     with_each = [
         code
         for code, number in calls.items()
-        if PACKAGE in code.co_filename and number >= 0.9 * messages
+        if code.co_filename.startswith(PACKAGE) and number >= 0.9 * messages
     ]
     return {
         'calls': sum(calls.values()) / messages,
@@ -161,7 +164,7 @@ def _own(counts: Counter[Any]) -> Counter[Any]:
         {
             code: number
             for code, number in counts.items()
-            if PACKAGE in code.co_filename and not code.co_filename.endswith(waiting)
+            if code.co_filename.startswith(PACKAGE) and not code.co_filename.endswith(waiting)
         }
     )
 

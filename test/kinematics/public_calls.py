@@ -26,8 +26,11 @@ from diffdrive_jacobian.control import Arrival, StraightLine, VelocityLimits, Wa
 from diffdrive_jacobian.kinematics import contact, diff_drive, rigid_body, se2, spatial
 from diffdrive_jacobian.kinematics import inverse_kinematics as ik
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
-from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
-from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+from diffdrive_jacobian.kinematics.mobile_manipulator import (
+    MobileManipulator,
+    mobile_manipulator_jacobian,
+)
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm, arm_forward_kinematics, arm_jacobian
 from diffdrive_jacobian.kinematics.spatial_arm import SpatialArm
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel, odometry_noise
 from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
@@ -103,6 +106,11 @@ BROADCASTING = {
     ik.pose_difference: {'target': (1.0, 2.0, 3.0), 'pose': (0.5, 0.5, -3.0)},
     **{call: {'q': Q} for call in (ARM.joint_positions, ARM.forward_kinematics)},
     **{call: {'q': Q} for call in (ARM.jacobian, ARM.determinant)},
+    **{call: {'lengths': (1.0, 0.7), 'q': Q} for call in (arm_forward_kinematics, arm_jacobian)},
+    mobile_manipulator_jacobian: {
+        **{'lengths': (1.0, 0.7), 'theta': 0.5, 'q': Q, 'mount': (0.1, 0.2)},
+        **WHEELS,
+    },
     ARM.singular_configurations: {'q_1': 0.5},
     ARM.inverse_kinematics: {'position': (1.0, 0.5)},
     ARM.inverse_velocity: {'q': Q, 'x_dot': X_DOT},
