@@ -433,5 +433,8 @@ def test_the_page_says_when_the_connection_is_lost(live):
     browser.until('document.getElementById("connection").innerText.includes("lost")')
     assert browser.evaluate('document.querySelectorAll("#pad .held").length') == 0
     browser.key('Up', 'KeyW')
-    browser.click(live.place(100, 100))
+    # Also through a notice, which lies on the map.
+    browser.evaluate('document.getElementById("goto-x").value = "?"')
+    browser.evaluate('document.getElementById("goto").requestSubmit()')
+    browser.click('.notice span')
     browser.until('document.getElementById("notices").innerText.includes("there is no connection")')
