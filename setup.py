@@ -40,7 +40,7 @@ COMMANDS = [
     'calibrate_run',
     'grade_hand_ins',
 ]
-NOT_IN_PACKAGE = ('doc', 'test', 'config', 'resource')
+NOT_IN_PACKAGE = ('doc', 'test', 'config', 'resource', '.ci', '.github')
 """Folders that a source distribution has beside the package."""
 MESSAGES = '5.3.6'
 CORE_MESSAGES = '2.0.3'
@@ -53,7 +53,7 @@ class SourceDistribution(sdist):
         """Add what is no part of the package."""
         files = (path for folder in NOT_IN_PACKAGE for path in Path(folder).rglob('*'))
         kept = (path for path in files if path.is_file() and '__pycache__' not in path.parts)
-        beside = ('CHANGELOG.rst', 'LICENSE', 'package.xml', '.mypy.ini', '.ruff.toml', *glob('.ci/*'))
+        beside = ('CHANGELOG.rst', 'LICENSE', 'package.xml', '.mypy.ini', '.ruff.toml')
         self.filelist.extend(sorted([*map(str, kept), *beside]))
         super().make_distribution()
 

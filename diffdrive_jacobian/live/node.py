@@ -256,8 +256,11 @@ def watch_nodes(
                 page.stop()
 
 
-def drive_live(drive: PageDrive) -> None:
+def drive_live(drive: PageDrive) -> bool:
     """Run robots, wheel bridges and controllers in this process, with the page.
+
+    Returns:
+        Whether a page was open, so that what there is to send was sent.
 
     Raises:
         UserError: A node cannot run with the parameters or ROS arguments given.
@@ -301,7 +304,7 @@ def drive_live(drive: PageDrive) -> None:
 
         if pacing is None:
             runner.spin(work)
-            return
+            return not waiting
         assert isinstance(runner, LockstepRunner)
 
         def meanwhile() -> bool:
@@ -311,3 +314,4 @@ def drive_live(drive: PageDrive) -> None:
             return over
 
         runner.spin(lambda: work() or pacing.pace(runner.seconds(), meanwhile))
+        return not waiting

@@ -218,8 +218,11 @@ class ValuePage:
         self.settle()
 
 
-def drive_live(drive: PageDrive) -> None:
+def drive_live(drive: PageDrive) -> bool:
     """Drive robots, bridges and controllers without ROS, with the page. They are always isolated.
+
+    Returns:
+        Whether a page was open, so that what there is to send was sent.
 
     Raises:
         UserError: The parameters or the ROS arguments are invalid.
@@ -263,3 +266,4 @@ def drive_live(drive: PageDrive) -> None:
         while not (work() or pacing.pace(page.seconds, work)):
             page.advance()
         page.stop()
+        return not waiting

@@ -157,7 +157,7 @@ def _drive_with_page(goals: Goals, options: argparse.Namespace, how: dict[str, A
             from diffdrive_jacobian.live.value_page import drive_live
         from diffdrive_jacobian.live.page_drive import PageDrive
 
-        drive_live(
+        sent = drive_live(
             PageDrive(
                 goals=goals,
                 port=options.port,
@@ -174,6 +174,8 @@ def _drive_with_page(goals: Goals, options: argparse.Namespace, how: dict[str, A
                 **how,
             )
         )
+    if not sent:
+        return _output.complain(PROGRAM, 'no page was open: nothing was sent, and nothing drove', FAILED)
     return DONE
 
 

@@ -170,7 +170,8 @@ def test_parameter_tables_are_as_generated():
 @pytest.mark.slow
 def test_the_page_of_public_names_is_as_generated():
     """To write it, every public name is imported."""
-    assert TEXTS['doc/public.md'] == pages.public_page()
+    written = TEXTS['doc/public.md'] == pages.public_page()
+    assert written, 'python test/documentation/pages.py public writes it'
 
 
 # --- The documents, nodes and tools

@@ -162,6 +162,15 @@ def test_drive_to_live_in_real_time(run_with_page):
     run_with_page(drive, 'drive_to', 0.1, 0, '--live', '--no-record', *QUICK)
 
 
+@pytest.mark.parametrize('ros', [True, False])
+def test_what_was_not_sent_because_no_page_was_open_is_told(monkeypatch, ros):
+    monkeypatch.setattr(driving, 'has_ros', lambda: ros)
+    command = ('drive_to', 1, 1, '--live', '--lockstep', '--no-browser', '--no-record')
+    ended = commands.run(*command, signals=commands.interrupted())
+    assert (ended.code, 'no page was open: nothing was sent' in ended.err) == (1, True)
+    assert commands.run('drive_to', *command[3:], signals=commands.interrupted()).code == 0
+
+
 def test_without_a_display_the_address_is_printed_and_no_browser_started(monkeypatch, capsys):
     server = SimpleNamespace(url='http://127.0.0.1:1/secret/', opening_url='', shared_url='')
     monkeypatch.setattr(watch_run.threading, 'Thread', None)
