@@ -56,10 +56,12 @@ def test_damped_inverse(hand_in: HandIn) -> None:
 
 @pytest.mark.points(1)
 def test_bounded(hand_in: HandIn) -> None:
-    """Where the arm is stretched, no joint moves faster than the tip divided by twice the damping."""
-    J = np.asarray(PlanarArm(LENGTHS).jacobian([0.3, 0.0])[:2])
-    inverse = hand_in.array('damped_inverse', J, 0.1, shape=(2, 2))
-    largest = float(np.linalg.norm(inverse, 2))
-    assert largest <= 5.0 + 1e-9, (
-        f'the largest gain must be at most 1 / (2 damping) = 5, got {largest:.6g}'
+    """While the arm is stretched, the joints may become as fast as the tip divided by twice the damping."""
+    largest = 0.0
+    for bend in np.linspace(0.6, 0.0, 25):
+        J = np.asarray(PlanarArm(LENGTHS).jacobian([0.3, bend])[:2])
+        inverse = hand_in.array('damped_inverse', J, 0.1, shape=(2, 2))
+        largest = max(largest, float(np.linalg.norm(inverse, 2)))
+    assert 4.9 < largest <= 5.0 + 1e-9, (
+        f'the largest gain must be 1 / (2 damping) = 5, rounded down, got {largest:.6g}'
     )

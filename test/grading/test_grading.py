@@ -34,18 +34,40 @@ pytestmark = pytest.mark.process
 PAGE = Path(__file__).parents[2] / 'doc' / 'solutions.md'
 SOLUTIONS = dict(re.findall(r'```python\n# (\w+)\.py\n(.*?)```', PAGE.read_text(), flags=re.DOTALL))
 WRONG = {
-    'wheels': ('r / L, -r / L', '-r / L, r / L'),
-    'angles': ('np.arctan2(np.sin(angle), np.cos(angle))', 'angle % (2 * np.pi)'),
-    'gains': ('6.0, 1.5', '1.5, 6.0'),
-    'three_laws': ('0.5 * math.hypot(dx, dy), 3.0 * error', '0.5 * math.hypot(dx, dy)'),
-    'offset_point': ('-sine / d', 'sine / d'),
-    'damping': ('damping**2', 'damping'),
-    'null_space': ('+ projector(J) @ wanted', '+ wanted'),
-    'limits': ('v / scale, omega / scale', 'v / scale, omega'),
-    'eight': ('2.0 * along, omega', '2.0 * along + omega'),
-    'lost_odometry': ('age > 0.3', 'age > 3.0'),
+    'wheels': [('r / L, -r / L', '-r / L, r / L'), ('1 / r, -L', '1 / r, L')],
+    'angles': [
+        ('np.arctan2(np.sin(angle), np.cos(angle))', 'angle % (2 * np.pi)'),
+        ('np.arctan2(np.sin(angle), np.cos(angle))', 'math.atan2(math.sin(angle), math.cos(angle))'),
+    ],
+    'gains': [('6.0, 1.5', '1.5, 6.0'), ('e + kv', 'e - kv'), ('kp > kv', 'kp > kv / 2')],
+    'three_laws': [
+        ('0.5 * math.hypot(dx, dy), 3.0 * error', '0.5 * math.hypot(dx, dy), 0.01'),
+        ('return 0.0, 3.0 * error', 'return -0.5, 3.0 * error'),
+        ('0.5 * math.hypot', '0.005 * math.hypot'),
+    ],
+    'offset_point': [
+        ('-sine / d', 'sine / d'),
+        ('-d * sine', 'd * sine'),
+        ('k * (np', 'np.array([k, k / 2]) * (np'),
+    ],
+    'damping': [
+        ('damping**2', 'damping'),
+        ('-reach[1], reach', '-steps[1], steps'),
+        ('damping**2', '0.04'),
+    ],
+    'null_space': [
+        ('+ projector(J) @ wanted', '+ wanted'),
+        ('+ projector(J) @ wanted', ''),
+        ('- np.linalg.pinv(J) @ J', '- J.T @ J'),
+    ],
+    'limits': [('v / scale, omega / scale', 'v / scale, omega'), ('3.0 * max_omega', '0.1 * max_omega')],
+    'eight': [
+        ('cosine * dx + sine', 'cosine * dx - sine'),
+        ('2.0 * along, omega', '2.0 * along, 0.5 * omega'),
+    ],
+    'lost_odometry': [('age > 0.3', 'age > 3.0'), ('pose is None or ', '')],
 }
-"""What a student may write instead."""
+"""What students may write instead. Each test notices one of them."""
 
 
 def grade(exercise, folder, *sources, options=()):
@@ -61,20 +83,23 @@ def grade(exercise, folder, *sources, options=()):
         return ended, list(csv.DictReader(file))
 
 
-def test_each_exercise_has_a_solution_and_a_mistake():
+def test_each_exercise_has_a_solution_and_mistakes():
     assert exercises() == sorted(SOLUTIONS) == sorted(WRONG)
 
 
 @pytest.mark.parametrize('name', sorted(WRONG))
-def test_the_solution_has_all_points_and_a_mistake_has_not(tmp_path, name):
-    right, (old, new) = SOLUTIONS[name], WRONG[name]
-    assert old in right
-    ended, (good, bad) = grade(name, tmp_path, right, right.replace(old, new))
+def test_the_solution_has_all_points_and_each_test_notices_a_mistake(tmp_path, name):
+    right = SOLUTIONS[name]
+    assert all(old in right for old, _ in WRONG[name])
+    ended, (good, *bad) = grade(name, tmp_path, right, *(right.replace(*one) for one in WRONG[name]))
     assert ended.code == 0
     assert good['points'] == good['of'] != '0', ended.out
     assert good['reasons'] == ''
-    assert float(bad['points']) < float(bad['of'])
-    assert bad['reasons']
+    tests = {*good} - {'hand_in', 'points', 'of', 'seconds', 'reasons'}
+    lost = [{test for test in tests if row[test] != good[test]} for row in bad]
+    assert all(lost), lost
+    assert set.union(*lost) == tests
+    assert all(row['reasons'] for row in bad)
 
 
 EXERCISE = """

@@ -42,6 +42,8 @@ from diffdrive_jacobian.live.commands import (
     Reset,
     SendGoal,
     SetParameter,
+    SetSpeed,
+    Step,
 )
 from diffdrive_jacobian.live.node import LivePage
 from diffdrive_jacobian.live.pacing import Pacing
@@ -387,6 +389,19 @@ def test_without_a_page_nothing_is_computed(driven):
     before = driven.session.latest()[0]
     driven.pass_time(0.2)
     assert driven.session.latest()[0] == before
+
+
+@pytest.mark.parametrize('controlled', [True, False])
+def test_time_obeys_the_page_without_nodes_where_it_is_simulated(controlled):
+    live, pacing = LiveValues(), Pacing()
+    live.node = ValuePage(live.session, [live.world], pacing, controlled=controlled)
+    live.send(SetSpeed(5.0), Step())
+    live.pass_time()
+    assert (pacing.speed, pacing.paused) == ((5.0, True) if controlled else (1.0, False))
+    live.send(Pause(paused=False))
+    live.pass_time()
+    assert not pacing.paused
+    assert len(live.texts) == (0 if controlled else 3)
 
 
 def test_a_robot_without_a_controller(live):

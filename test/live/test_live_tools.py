@@ -118,7 +118,7 @@ def test_watch_run_beside_nodes_and_the_robot_stops_with_the_page(world):
         (True, (0.2, 0.1), r'goal \(0\.2, 0\.1\) arrived: .* x 0\..* 0\.0\d\d m from the goal'),
         (False, (0.2, 0.1), r'goal \(0\.2, 0\.1\) arrived: .* x 0\..* 0\.0\d\d m from the goal'),
         (
-            True,
+            False,
             ('--path', 'circle:0.2'),
             r'path to \(.*\) arrived: .* 0\.0\d\d m from the end of the path',
         ),

@@ -31,6 +31,7 @@ from diffdrive_jacobian.drives import drive, driving, nodes, values
 from diffdrive_jacobian.drives.driving import as_goals
 from diffdrive_jacobian.drives.outcome import Outcome, Request
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.messages.codecs import Route
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.signals import Signals
@@ -89,11 +90,13 @@ CASES = {
         'parameters': {'controller': 'offset_point', **QUICK},
         'robot': {'x': 0.3, 'theta': 4.0},
     },
-    # The robot stops again and again.
+    # The robot stops again and again, and the state of the law begins anew.
     'odometry that is rarer than the timeouts': {
-        'parameters': {'odom_timeout': 0.3},
+        'laws': {'controller': SPIRAL},
+        'parameters': {'odom_timeout': 0.3, 'boost': 2.0},
         'robot': {'publish_rate': 1.7},
     },
+    'a goal where the robot is': {'goals': [[0.0, 0.0]]},
     'limits of the bridge': {
         'parameters': QUICK,
         'arguments': [*BRIDGE, '-p', 'wheel_bridge:publish_rate:=77.0'],
@@ -178,11 +181,34 @@ def test_progress_and_signals_are_those_of_the_nodes():
     assert outcome.run.odometry.values[-1, 3:].tolist() == [0.0, 0.0]
 
 
-def test_real_time_passes():
+def test_real_time_passes(monkeypatch):
+    slept = []
+    monkeypatch.setattr(values.time, 'sleep', slept.append)
+    monkeypatch.setattr(values.time, 'monotonic', lambda: 100.0 + sum(slept))
     slow = values.drive(request([[0.5, 0.0]], timeout=0.3), lockstep=False)
     received = slow.run.odometry.received
     assert abs(np.ptp(received) / 1e9 - (len(received) - 1) / 50) < 1e-6
     assert slow.seconds == pytest.approx(0.3, abs=0.03)
+    # Also until the robot stands.
+    assert sum(slept) == pytest.approx(np.ptp(received) / 1e9, abs=0.03)
+    assert min(slept) >= 0.0
+
+
+def test_advice_is_about_what_is_driven(caplog):
+    def advised(topic='', *poses):
+        world = values.World({'path_controller': 'kanayama'}, {}, (), values.START)
+        if topic:
+            world.publish(topic, Route((1, 0), '', poses))
+        # A law of goals that spirals, and one of paths that weaves.
+        for name, value in (('kp', 0.2), ('k_theta', 0.1)):
+            world.set_parameter('go_to_goal', name, value)
+        text, _ = caplog.text, caplog.clear()
+        return 'spirals' in text, 'weaves' in text
+
+    here, there = (0.0, 0.0, 0.0), (5.0, 0.0, 0.0)
+    assert advised() == (True, True)
+    assert advised('goals', there) == (True, False)
+    assert advised('path', here, there) == (False, True)
 
 
 WRONG = [
