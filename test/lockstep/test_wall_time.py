@@ -105,6 +105,8 @@ def test_a_loop_that_spins_once_at_a_time_repeats():
 @compiled
 def test_who_is_due_at_once_goes_on_in_the_order_of_its_threads():
     """Also without use_sim_time. Nothing is left open."""
+    # What rclpy opens once stays open.
+    run('sleep')
     before = len(os.listdir('/proc/self/fd'))
     heard, _ = run('two', use_sim_time=False)
     assert heard['two'] == [(20.0 * number, 'timer thread') for number in range(1, 16)]
@@ -148,6 +150,22 @@ def test_a_thread_in_cpp_that_waits_on_wall_time_is_warned_of(monkeypatch):
         world.publish('poke', String())
         with pytest.warns(UserWarning, match='a thread that it has started meanwhile waits with'):
             world.run_for(0.1)
+
+
+@compiled
+@pytest.mark.parametrize(('root', 'first'), [(0, 5), (32760, 32761)])
+def test_of_those_that_are_due_at_once_the_oldest_thread_is_first(root, first, monkeypatch, tmp_path):
+    """Also where the system begins anew with small ids, after the largest one."""
+    monkeypatch.setattr(wall_time, 'PID_MAX', tmp_path / 'pid_max')
+    wall_time.PID_MAX.write_text('32768\n')
+    there = wall_time.WallTime(1)
+    there.root = root
+    slots = there._slots
+    slots['until'][:3], slots['state'][:3], slots['thread'][:3] = 20, wall_time.WAITS, [5, -32761, 300]
+    until, slot = there.next()
+    assert (until, abs(int(slots['thread'][slot]))) == (20, first)
+    del slots
+    there.close()
 
 
 @compiled

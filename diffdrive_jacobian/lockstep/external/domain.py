@@ -83,6 +83,8 @@ class Domain:
                 variables |= self.wall_time.environment()
             self.child: ExternalProcess = command.start(variables, rules_apart(sorted(apart)))
             self.child.wake = wake
+            if self.wall_time is not None:
+                self.wall_time.root = self.child.root
             self.quiet = Quiet(self.child.root, self._receiving)
             self._closing.callback(self.quiet.threads.close)
             self.child.check_addresses()

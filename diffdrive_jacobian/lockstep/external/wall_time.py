@@ -43,6 +43,7 @@ COMPILERS = ('cc', 'gcc', 'clang')
 FLAGS = ('-shared', '-fPIC', '-O2', '-pthread')
 FUTEX = {'x86_64': 202, 'aarch64': 98}
 WAKE, ALL = 1, 2**31 - 1
+PID_MAX = Path('/proc/sys/kernel/pid_max')
 FREE, WAITS, DUE = 0, 2, 3
 """States of a slot: nobody has it, somebody waits, and goes on."""
 MANY = 100
@@ -85,6 +86,9 @@ class WallTime:
             self._page.slots, [('until', np.int64), ('state', np.int32), ('thread', np.int32)]
         )
         self._libc, self._futex = ctypes.CDLL(None), FUTEX[platform.machine()]
+        self.root = 0
+        """Process that has started all others."""
+        self._ids = int(PID_MAX.read_text())
         self.give(now, now)
 
     def environment(self) -> dict[str, str]:
@@ -118,7 +122,8 @@ class WallTime:
             self._free_abandoned()
         if not len(waiting):
             return None
-        first = min(waiting, key=lambda slot: (until[slot], abs(thread[slot])))
+        # After the largest id of a thread the system begins anew with the smallest.
+        first = min(waiting, key=lambda slot: (until[slot], (abs(thread[slot]) - self.root) % self._ids))
         return int(until[first]), int(first)
 
     def _free_abandoned(self) -> None:
