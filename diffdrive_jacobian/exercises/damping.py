@@ -56,7 +56,7 @@ def test_damped_inverse(hand_in: HandIn) -> None:
 
 @pytest.mark.points(1)
 def test_bounded(hand_in: HandIn) -> None:
-    """While the arm is stretched, the joints may become as fast as the tip divided by twice the damping."""
+    """As the arm stretches, joints reach the speed of the tip divided by twice the damping, not more."""
     largest = 0.0
     for bend in np.linspace(0.6, 0.0, 25):
         J = np.asarray(PlanarArm(LENGTHS).jacobian([0.3, bend])[:2])

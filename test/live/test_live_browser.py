@@ -51,7 +51,7 @@ def live(tmp_path_factory):
     """A browser with the page of `drive_to --live --lockstep`."""
     with open_world(tmp_path_factory.mktemp('browser')) as world, pytest.MonkeyPatch.context() as patch:
         # All tests use it.
-        patch.setattr(processes, 'LIMIT', 150.0)
+        patch.setattr(processes, 'LIMIT', 400.0)
         child = world.start('drive_to', '--live', '--lockstep', '--no-record', '--no-browser', *QUICK)
         browser = Browser()
         try:
