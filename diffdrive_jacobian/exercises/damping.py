@@ -63,5 +63,5 @@ def test_bounded(hand_in: HandIn) -> None:
         inverse = hand_in.array('damped_inverse', J, 0.1, shape=(2, 2))
         largest = max(largest, float(np.linalg.norm(inverse, 2)))
     assert 4.9 < largest <= 5.0 + 1e-9, (
-        f'the largest gain must be 1 / (2 damping) = 5, rounded down, got {largest:.6g}'
+        f'the largest gain must rise to 1 / (2 damping) = 5 and no further, got {largest:.6g}'
     )
