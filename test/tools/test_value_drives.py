@@ -97,8 +97,10 @@ CASES = {
         'robot': {'publish_rate': 1.7},
     },
     'a goal where the robot is': {'goals': [[0.0, 0.0]]},
+    # Between two commands its speeds are those that were commanded.
     'limits of the bridge': {
         'parameters': QUICK,
+        'robot': {'publish_rate': 3.0},
         'arguments': [*BRIDGE, '-p', 'wheel_bridge:publish_rate:=77.0'],
     },
     'arguments for all': {
