@@ -186,8 +186,8 @@ def _grade(
         process = subprocess.Popen(
             [*command, str(exercise)],
             cwd=folder,
-            # What is ended at once leaves its folders here.
-            env={**os.environ, 'TMPDIR': folder},
+            # What is ended at once leaves its folders here. Who grades may own nothing else.
+            env={**os.environ, 'TMPDIR': folder, 'ROS_LOG_DIR': folder},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -57,6 +57,8 @@ MAX_ROBOTS = 16
 """Largest number of robots that are shown."""
 LOST = 30.0
 """Time without odometry and publisher after which a robot is no longer shown (s)."""
+CANCELED_WITHIN = 1.0
+"""Longest time that a controller needs to say that it drives no more (s)."""
 RECORDED_AFTER = 1.5 * RECORDED_PERIOD
 """Time after which the recorder has found the publishers of the page (s)."""
 
@@ -122,6 +124,17 @@ class LivePage(Node):  # type: ignore[misc]
     def is_ready(self, one: Member) -> bool:
         """Return whether a robot and its controller are there."""
         return one.namespace in self.robots and self.robots[one.namespace].ready
+
+    @property
+    def drives(self) -> bool:
+        """Whether a robot drives to a goal or along a path."""
+        return any(robot.state.goal.active for robot in self.robots.values())
+
+    def cancel(self) -> None:
+        """Cancel goals and paths."""
+        for robot in self.robots.values():
+            if robot.state.goal.active:
+                robot.cancel()
 
     def stop(self) -> None:
         """Stop what pages drive by hand."""
@@ -302,9 +315,20 @@ def drive_live(drive: PageDrive) -> bool:
                     drive.send(page.robots)
             return drive.signals.count > 0
 
+        def end() -> bool:
+            """Cancel what is driven to, and wait until its end was told."""
+            page.cancel()
+
+            def ended() -> bool:
+                page.work()
+                return not page.drives
+
+            runner.spin(ended, timeout=CANCELED_WITHIN)
+            return not waiting
+
         if pacing is None:
             runner.spin(work)
-            return not waiting
+            return end()
         assert isinstance(runner, LockstepRunner)
 
         def meanwhile() -> bool:
@@ -314,4 +338,4 @@ def drive_live(drive: PageDrive) -> bool:
             return over
 
         runner.spin(lambda: work() or pacing.pace(runner.seconds(), meanwhile))
-        return not waiting
+        return end()

@@ -172,7 +172,7 @@ class SteeredRobot(ABC):
         elif isinstance(command, Release):
             self.hand.release(page)
         elif isinstance(command, CancelGoal):
-            self._call('cancel_goal')
+            self.cancel()
         elif isinstance(command, Reset):
             self._call('reset_odometry')
             self.state.interrupt()
@@ -277,6 +277,10 @@ class SteeredRobot(ABC):
             # The robot is another node, with parameters of the same names.
             return ''
         return rolls_on(model.actuators, self.hand.twist, model)
+
+    def cancel(self) -> None:
+        """Cancel a goal or path."""
+        self._call('cancel_goal')
 
     def stop(self) -> None:
         """Stop what a page drives."""

@@ -116,6 +116,17 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
     # `--log-level` applies to the process, so it is restored with the context.
     log_level = get_logger_level('')
     try:
+        _init(context, arguments)
+        yield context
+    finally:
+        # Also after an init that has failed half way.
+        # Without an argument rclpy also replaces the default context by a new one.
+        rclpy.try_shutdown(context=None if default else context)
+        set_logger_level('', log_level)
+
+
+def _init(context: Context, arguments: Sequence[str]) -> None:
+    try:
         rclpy.init(
             args=list(arguments),
             context=context,
@@ -127,14 +138,11 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
             'that ends the ROS arguments'
         ) from error
     except (RuntimeError, UnicodeError) as error:
-        raise UserError(_rule_error(arguments) or f'ROS arguments: {reason(error)}') from error
+        why = reason(error)
+        if 'initialize logging' in why:
+            raise UserError(f'{why}: set ROS_LOG_DIR to a folder that can be written') from error
+        raise UserError(_rule_error(arguments) or f'ROS arguments: {why}') from error
     use_arguments(context, arguments)
-    try:
-        yield context
-    finally:
-        # Without an argument rclpy also replaces the default context by a new one.
-        rclpy.try_shutdown(context=None if default else context)
-        set_logger_level('', log_level)
 
 
 def _rule_error(arguments: Sequence[str]) -> str:

@@ -323,7 +323,8 @@ def _print_goal_end(end: GoalEnd) -> None:
         )
     robot = '' if end.robot == '/' else f'{end.robot}: '
     what = 'path to' if end.path else 'goal'
-    print(f'{robot}{what} ({end.goal[0]:g}, {end.goal[1]:g}) {ends[end.state]}: {where}', flush=True)
+    x, y, _ = (end.goal.round(6) + 0.0).tolist()
+    print(f'{robot}{what} ({x:g}, {y:g}) {ends[end.state]}: {where}', flush=True)
 
 
 def _parser() -> _cli.Parser:

@@ -163,6 +163,18 @@ def test_drive_to_live_in_real_time(run_with_page):
 
 
 @pytest.mark.parametrize('ros', [True, False])
+@pytest.mark.parametrize('how', [(), ('--lockstep',)])
+def test_a_goal_that_an_interrupt_cancels_is_told(run_with_page, monkeypatch, ros, how):
+    monkeypatch.setattr(driving, 'has_ros', lambda: ros)
+
+    def drive(page):
+        until(lambda: robots(page).get('/', {}).get('goal', {}).get('active'), 'drives')
+
+    out = run_with_page(drive, 'drive_to', 30, 0, '--live', '--no-record', *how)
+    assert re.search(r'^goal \(30, 0\) canceled: the robot is at x ', out, re.MULTILINE)
+
+
+@pytest.mark.parametrize('ros', [True, False])
 def test_what_was_not_sent_because_no_page_was_open_is_told(monkeypatch, ros):
     monkeypatch.setattr(driving, 'has_ros', lambda: ros)
     command = ('drive_to', 1, 1, '--live', '--lockstep', '--no-browser', '--no-record')

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from contextlib import contextmanager
 
@@ -190,6 +191,29 @@ def test_domains_that_do_not_exist_are_named(monkeypatch, domain):
     words = f'must be in 0 to 232, got {domain!r}'
     with pytest.raises(UserError, match=words), ros_context(['test']):
         pass
+
+
+WITHOUT_LOG = """
+import os
+from diffdrive_jacobian.ros.runner import UserError, ros_context
+
+for folder in ('/proc/none', os.curdir):
+    os.environ['ROS_LOG_DIR'] = folder
+    try:
+        with ros_context(['test'], default=True) as context:
+            print(context.ok())
+    except UserError as error:
+        print(error)
+"""
+
+
+@pytest.mark.process
+def test_a_log_that_cannot_be_written_is_named_and_the_next_context_is_a_new_one(tmp_path):
+    command = [sys.executable, '-c', WITHOUT_LOG]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60)
+    first, second = ended.stdout.splitlines()
+    assert first.endswith('set ROS_LOG_DIR to a folder that can be written')
+    assert second == 'True'
 
 
 def test_log_level_does_not_outlast_the_context(capfd):

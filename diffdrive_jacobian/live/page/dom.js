@@ -56,7 +56,8 @@ export function format(value, digits = 3) {
 /** Return what a person typed as a number; NaN: it is none. */
 export function parseNumber(text) {
   const plain = text.trim().replace('−', '-').replace(',', '.');
-  return plain === '' ? NaN : Number(plain);
+  // No other base, which Number would read.
+  return /^[-+\d.e]+$/i.test(plain) ? Number(plain) : NaN;
 }
 
 /** Return a heading that a person typed (rad), as `--heading` and `--degrees` take it; null: none; NaN: it is invalid. */
