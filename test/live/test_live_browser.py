@@ -302,6 +302,8 @@ def test_on_a_path_its_law_drives_and_is_chosen_and_tuned(live, tmp_path):
     # Although the page was opened at once.
     assert len(read_run(tmp_path / 'bag').planned_path) > 10
     live.open(live.child)
+    # The page of the program that has ended may have tried to connect again.
+    browser.errors.clear()
 
 
 def test_nothing_is_clipped_or_covered_on_usual_screens(live):
