@@ -142,7 +142,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     given = of if report.passed else 0.0
     grade = Grade(*_named(item), given, of, reason)
     item.config.stash[REPORT].grades.append(grade)
-    _tell(item.config, asdict(grade))
+    _print_grade(item.config, asdict(grade))
 
 
 def _points(item: pytest.Item) -> float:
@@ -156,19 +156,19 @@ def _named(item: pytest.Item) -> tuple[str, str]:
     return item.name.removeprefix('test_'), doc.strip().partition('\n')[0].rstrip('.')
 
 
-def _tell(config: pytest.Config, grade: dict[str, Any]) -> None:
-    """Tell `grade_hand_ins` a grade, by the standard output: a hand-in cannot write to that."""
+def _print_grade(config: pytest.Config, grade: dict[str, Any]) -> None:
+    """Print a grade for `grade_hand_ins`, on the standard output: a hand-in cannot write to that."""
     word = config.getoption('--grades')
     if word is not None:
         config.get_terminal_writer().line(f'\n{word}{json.dumps(grade)}')
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Tell what can be given, before a hand-in takes too long."""
+    """Print what can be given, before a hand-in takes too long."""
     for item in items:
         if 'hand_in' in getattr(item, 'fixturenames', ()):
             name, task = _named(item)
-            _tell(config, asdict(Grade(name, task, 0.0, _points(item), LATE)))
+            _print_grade(config, asdict(Grade(name, task, 0.0, _points(item), LATE)))
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:

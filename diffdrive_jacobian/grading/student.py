@@ -122,7 +122,7 @@ def end_with_parent() -> None:
 def described(error: BaseException, name: str) -> str:
     """Return what went wrong in words, with the line of the hand-in."""
     # Of the fence. Python's own says that a module lacks a name.
-    if isinstance(error, ImportError) and not error.args[0:1] > ('',):
+    if isinstance(error, ImportError) and not error.msg:
         return f'imports {error.name}, and may import numpy and what computes in the standard library'
     line, trace = 0, error.__traceback__
     while trace is not None:
