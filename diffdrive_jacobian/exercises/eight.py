@@ -66,7 +66,7 @@ def follow(hand_in: HandIn, **robot: Any) -> Outcome:
 def test_eight(hand_in: HandIn, save_picture: SavePicture) -> None:
     """The eight is followed within 2 cm, in 60 s."""
     outcome = follow(hand_in)
-    save_picture(outcome.plot())
+    save_picture(outcome.plot)
     assert outcome.arrived, f'after {outcome.seconds:.0f} s, {outcome.distance:.2f} m are still to go'
     assert outcome.across < 0.02, f'the robot leaves the path by {outcome.across:.3f} m, allowed 0.02 m'
 

@@ -66,4 +66,4 @@ def test_gains(hand_in: HandIn, save_picture: SavePicture) -> None:
         )
         length = float(np.hypot(*np.diff(outcome.run.odometry.values[:, :2], axis=0).T).sum())
         assert length <= 1.3, f'kp = {kp:g}, kv = {kv:g}: it drives {length:.2f} m to a goal 1 m away'
-    save_picture(outcome.plot())
+    save_picture(outcome.plot)

@@ -71,7 +71,7 @@ def test_law(hand_in: HandIn, save_picture: SavePicture) -> None:
     outcome = drive(
         [[-1.0, 0.5]], controller=controller, lockstep=True, timeout=30.0, parameters={'offset': 0.2}
     )
-    save_picture(outcome.plot())
+    save_picture(outcome.plot)
     assert outcome.arrived, (
         f'the point is {outcome.distance:.2f} m from the goal after {outcome.seconds:.0f} s'
     )

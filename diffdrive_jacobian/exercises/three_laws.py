@@ -71,7 +71,7 @@ def test_as_short_as_others(hand_in: HandIn, save_picture: SavePicture) -> None:
     """The way is at most a tenth longer than by the laws go_to_goal and offset_point."""
     mine = drive_by(hand_in, GOALS, timeout=60.0)
     others = [drive(GOALS, controller=name, lockstep=True) for name in ('go_to_goal', 'offset_point')]
-    save_picture(run_figure([mine, *others]))
+    save_picture(lambda: run_figure([mine, *others]))
     assert mine.arrived, f'the robot is {mine.distance:.2f} m from the last goal after 60 s'
     limit = 1.1 * max(map(length, others))
     assert length(mine) <= limit, f'it drove {length(mine):.2f} m, others at most {limit / 1.1:.2f} m'

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -35,8 +35,8 @@ BROKEN = pytest.StashKey[Exception]()
 class SavePicture(Protocol):
     """What the fixture `save_picture` is."""
 
-    def __call__(self, figure: Any) -> None:
-        """Save a figure where --picture says."""
+    def __call__(self, draw: Callable[[], Any]) -> None:
+        """Call what draws a figure of matplotlib, and save it where --picture says."""
 
 
 LATE = 'not graded in time'
@@ -110,13 +110,13 @@ def hand_in(request: pytest.FixtureRequest) -> Iterator[HandIn]:
 
 @pytest.fixture
 def save_picture(request: pytest.FixtureRequest) -> SavePicture:
-    """A function that saves a figure as --picture says; without that it does nothing."""
+    """A function that draws a figure and saves it as --picture says; without that it does nothing."""
 
-    def save(figure: Any) -> None:
+    def save(draw: Callable[[], Any]) -> None:
         file = request.config.getoption('--picture')
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(file)
+            draw().savefig(file)
 
     return save
 

@@ -48,6 +48,8 @@ LONGEST_FRAME = 0.1
 """Longest duration of a frame in a notebook, unless a speed was given (s)."""
 INLINE_FRAMES = 100
 """Largest number of frames of a film in a notebook, each of which is a picture in it."""
+MOVES = 'moves'
+"""Mark of the lowest artist that moves in an axes."""
 LATER = 0.2
 """Opacity of what the robots have not done yet."""
 BUTTONS = {
@@ -129,7 +131,7 @@ class Film:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder, f'film.{ending}')
             with styled():
-                self._animation(self.frames).save(file, writer, dpi=DPI, progress_callback=progress)
+                self._animation(self.frames, DPI).save(file, writer, dpi=DPI, progress_callback=progress)
             return file.read_bytes()
 
     def _repr_html_(self) -> str:
@@ -143,17 +145,54 @@ class Film:
             'animation.frame_format': 'jpeg',
         }
         with styled(), matplotlib.rc_context(smaller):
-            page: str = self._animation(min(self.frames, INLINE_FRAMES)).to_jshtml()
+            page: str = self._animation(min(self.frames, INLINE_FRAMES), INLINE_DPI).to_jshtml()
         # Its buttons are icons that are loaded from elsewhere: these are letters.
         page = re.sub('<link[^>]*>', '', page)
         return re.sub('<i class="fa fa-([^"]*)"></i>', lambda icon: BUTTONS.get(icon[1], icon[1]), page)
 
-    def _animation(self, frames: int) -> Any:
+    def _animation(self, frames: int, dpi: int) -> Any:
+        """Return an animation of a figure that is nothing but the picture of a frame."""
         from matplotlib.animation import FuncAnimation
+        from matplotlib.figure import Figure
 
         shown = self._shown[np.linspace(0, self.frames - 1, frames).astype(int)]
         interval = 1e3 * min((self.seconds + HOLD) / frames, self._longest)
-        return FuncAnimation(self._figure, self._show, shown, interval=interval, repeat=False)
+        picture = self._pictures(dpi)
+        screen = Figure(figsize=self._figure.get_size_inches(), dpi=dpi)
+        image = screen.figimage(picture(shown[0]))
+
+        def show(time: float) -> tuple[()]:
+            image.set_data(picture(time))
+            return ()
+
+        return FuncAnimation(screen, show, shown, interval=interval, repeat=False)
+
+    def _pictures(self, dpi: int) -> Callable[[float], Any]:
+        """Return a function that draws the frame of a time, shape (height, width, 4).
+
+        Below what moves all is drawn once: axes and texts take a tenth of a second.
+        """
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        self._figure.set_dpi(dpi)
+        canvas, above = FigureCanvasAgg(self._figure), []
+        for axes in self._figure.axes:
+            lowest = min(one.get_zorder() for one in axes.get_children() if one.get_gid() == MOVES)
+            above += [one for one in axes.get_children() if one.get_zorder() >= lowest]
+        above.sort(key=lambda one: one.get_zorder())
+        for one in above:
+            one.set_animated(True)
+        canvas.draw()
+        below = canvas.copy_from_bbox(self._figure.bbox)
+
+        def picture(time: float) -> Any:
+            self._show(time)
+            canvas.restore_region(below)
+            for one in above:
+                one.axes.draw_artist(one)
+            return np.array(canvas.buffer_rgba())
+
+        return picture
 
     def _draw(self) -> list[Callable[[float], None]]:
         """Draw what moves; return functions that move it to a time."""
@@ -164,9 +203,10 @@ class Film:
             later.set_alpha(LATER)
         runs = zip(self._timelines, self._times, self._zeros, cycle(COLORS), strict=False)
         moves = [_robot(plane, *run, inches) for run in runs]
-        cursors = [panel.axvline(self._shown[0], color='black', lw=1.0, zorder=6) for panel in panels]
+        line: Any = {'color': 'black', 'lw': 1.0, 'zorder': 6, 'gid': MOVES}
+        cursors = [panel.axvline(self._shown[0], **line) for panel in panels]
         style: Any = {'transform': plane.transAxes, 'ha': 'right', 'va': 'bottom', 'fontsize': 11}
-        clock = plane.text(1.0, 1.01, '', **style)
+        clock = plane.text(1.0, 1.01, '', zorder=9, **style)
 
         def show(time: float) -> None:
             for cursor in cursors:
@@ -202,7 +242,7 @@ def _robot(
     truths[jumps(run.ground_truth)] = math.nan
     driven = plane.plot([], [], color=color, lw=2.6, zorder=3.5)[0]
     truth_times = np.maximum.accumulate(seconds(run, run.ground_truth)) - zero
-    truly = plane.plot([], [], color=color, zorder=3.4, **TRUTH)[0]
+    truly = plane.plot([], [], color=color, zorder=3.4, gid=MOVES, **TRUTH)[0]
     true = plane.plot([], [], 'D', ms=6, mfc='white', mec=color, mew=1.5, zorder=8.5)[0]
     parts: list[tuple[Array, Any]] = []
     mark = None

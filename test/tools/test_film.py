@@ -68,6 +68,15 @@ def test_robots_are_where_they_were_and_leave_a_trace(recorded):
         assert {tuple(one) for one in cursors} == {(one.time[-1] - zero(one) + 1e-6,) * 2}
 
 
+def test_a_frame_is_the_figure_of_its_time(recorded):
+    film = Film(recorded, speed=2.0)
+    picture = film._pictures(80)(2.0)
+    for artist in film._figure.findobj():
+        artist.set_animated(False)
+    film._figure.canvas.draw()
+    np.testing.assert_array_equal(picture, film._figure.canvas.buffer_rgba())
+
+
 def test_a_film_is_as_long_as_the_run_took_by_its_speed(recorded):
     seen = []
     film = Film(recorded[0], speed=8.0)
