@@ -108,17 +108,17 @@ def test_a_mistake_is_noticed(tmp_path, exercise, names, right, wrong):
     assert try_tests(tmp_path, exercise, source.replace(right, wrong), names.split()) == names.split()
 
 
-def grade(exercise, folder, *sources, options=()):
-    """Grade hand-ins, and return the output and the rows of the table."""
-    names = []
-    for number, source in enumerate(sources):
-        names.append(f'student_{number}.py')
-        (folder / names[-1]).write_text(source)
-    table = folder / 'points.csv'
-    ended = run('grade_hand_ins', exercise, *(folder / name for name in names), '--csv', table, *options)
+def grade(exercise, folder, sources, *options):
+    """Grade the hand-ins of files of a folder, and return the output and the rows of the table."""
+    files = [os.fsencode(folder) + b'/' + name for name in sources]
+    for file, source in zip(files, sources.values(), strict=True):
+        os.makedirs(os.path.dirname(file), exist_ok=True)
+        with open(file, 'w') as opened:
+            opened.write(source)
+    names, table = map(os.fsdecode, files), folder / 'points.csv'
+    ended = run('grade_hand_ins', exercise, *names, '--csv', table, *options)
     assert ended.err == ''
-    with table.open() as file:
-        return ended, list(csv.DictReader(file))
+    return ended, list(csv.DictReader(table.read_text().splitlines()))
 
 
 EXERCISE = """
@@ -144,26 +144,29 @@ def test_robot(hand_in):
 
 
 def test_a_table_has_points_and_reasons_that_no_spreadsheet_obeys(tmp_path):
+    """Also of files of one name, of a name that is no UTF-8, and of a text that cannot be written."""
     exercise = tmp_path / 'exercise.py'
     exercise.write_text(EXERCISE)
-    sources = (
-        'def twice(a): return 2 * a\ndef thrice(a): return 3 * a\n',
-        'def twice(a): return 2 * a\ndef thrice(a): raise ValueError("=cmd()")\n',
-        'import time\ndef twice(a): time.sleep(60)\n',
-        'import socket\n',
-    )
+    twice = 'def twice(a): return 2 * a\ndef thrice(a): '
+    sources = {
+        b'anna/mine.py': f'{twice}return 3 * a\n',
+        b'bert/mine.py': f'{twice}raise ValueError("=cmd()")\n',
+        b'slow.py': 'import time\ndef twice(a): time.sleep(60)\n',
+        b'socket.py': 'import socket\n',
+        b'bad\xff.py': 'def twice(a): raise ValueError("\\ud800")',
+    }
     pictures = tmp_path / 'pictures'
-    ended, rows = grade(exercise, tmp_path, *sources, options=('--pictures', pictures))
+    ended, rows = grade(exercise, tmp_path, sources, '--pictures', pictures)
     assert ended.code == 0
-    assert [row['points'] for row in rows] == ['3', '2', '0', '0']
+    assert [row['points'] for row in rows] == ['3', '2', '0', '0', '0']
     assert {row['of'] for row in rows} == {'3'}
     assert [rows[1][name] for name in ('twice', 'thrice', 'robot')] == ['2', '0', '0']
     assert rows[0]['reasons'] == 'A robot: not graded: no robot'
     assert 'Three times a number: thrice(3): ValueError: =cmd()' in rows[1]['reasons']
     assert 'took longer than 5 s' in rows[2]['reasons']
-    assert 'student_3.py cannot be run: imports socket' in rows[3]['reasons']
-    assert [one.name for one in pictures.iterdir()] == ['student_0.png']
-    with Image.open(pictures / 'student_0.png') as picture:
+    assert 'socket.py cannot be run: imports socket' in rows[3]['reasons']
+    assert [one.name for one in pictures.iterdir()] == ['1_anna_mine.png']
+    with Image.open(pictures / '1_anna_mine.png') as picture:
         assert picture.width > 100
     assert '3 of 3' in ended.out
 
@@ -182,34 +185,11 @@ def test_slow(hand_in): time.sleep(60)
 def test_what_was_earned_before_the_time_was_over_counts(tmp_path):
     exercise = tmp_path / 'late.py'
     exercise.write_text(LATE)
-    ended, (row,) = grade(exercise, tmp_path, 'def f(): pass\n', options=('--timeout', 4))
+    ended, (row,) = grade(exercise, tmp_path, {b'anna.py': 'def f(): pass\n'}, '--timeout', 4)
     assert ended.code == 1
     assert (row['points'], row['of'], row['quick'], row['slow']) == ('2', '5', '2', '0')
     assert 'not graded in time' in row['reasons']
     assert 'took longer than 4 s' in row['reasons']
-
-
-def test_one_hand_in_harms_no_other_and_no_file(tmp_path):
-    """Names that are no UTF-8, texts that cannot be written, and hand-ins of the same name."""
-    exercise = tmp_path / 'exercise.py'
-    exercise.write_text(EXERCISE)
-    right = 'def twice(a): return 2 * a\ndef thrice(a): return 3 * a\n'
-    files = [os.fsencode(tmp_path) + b'/bad\xff.py']
-    files += [os.fsencode(tmp_path / folder / 'mine.py') for folder in ('anna', 'bert')]
-    for file, source in zip(
-        files, ('def twice(a): raise ValueError("\\ud800")', right, right), strict=True
-    ):
-        os.makedirs(os.path.dirname(file), exist_ok=True)
-        with open(file, 'w') as opened:
-            opened.write(source)
-    table, pictures = tmp_path / 'points.csv', tmp_path / 'pictures'
-    names = map(os.fsdecode, files)
-    options = ('--csv', table, '--pictures', pictures)
-    ended = run('grade_hand_ins', exercise, *names, *options)
-    assert (ended.code, ended.err) == (0, '')
-    rows = list(csv.DictReader(table.read_text().splitlines()))
-    assert [row['points'] for row in rows] == ['0', '3', '3']
-    assert sorted(one.name for one in pictures.iterdir()) == ['2_anna_mine.png', '3_bert_mine.png']
 
 
 def test_mistakes_of_the_lecturer_are_named(tmp_path):
