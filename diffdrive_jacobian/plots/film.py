@@ -16,10 +16,11 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -121,18 +122,40 @@ class Film:
 
     def content(self, ending: str, progress: Callable[[int, int], object] | None = None) -> bytes:
         """Return the content of a file of one of the `FILM_FORMATS`; the rest as for `save`."""
-        from matplotlib.animation import FFMpegWriter, PillowWriter
+        from matplotlib.animation import FFMpegWriter
 
         if ending not in FILM_FORMATS:
             raise UserError(f'a film must end in .{", .".join(FILM_FORMATS)}, got {ending!r}')
-        if ending == 'mp4' and not FFMpegWriter.isAvailable():
+        if ending == 'gif':
+            return self._gif(progress or (lambda number, frames: None))
+        if not FFMpegWriter.isAvailable():
             raise UserError(NO_FFMPEG)
-        writer: Any = (PillowWriter if ending == 'gif' else FFMpegWriter)(fps=RATE)
+        writer: Any = FFMpegWriter(fps=RATE)
         with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder, f'film.{ending}')
+            file = Path(folder, 'film.mp4')
             with styled():
                 self._animation(self.frames, DPI).save(file, writer, dpi=DPI, progress_callback=progress)
             return file.read_bytes()
+
+    def _gif(self, progress: Callable[[int, int], object]) -> bytes:
+        """Return the content of a GIF. One frame after the other is drawn: all take gigabytes."""
+        from PIL import Image
+
+        moving = self.frames - int(HOLD * RATE)
+
+        def images() -> Iterator[Any]:
+            for frame, time in enumerate(self._shown[:moving]):
+                progress(frame, moving)
+                yield Image.fromarray(picture(time)[..., :3])
+
+        times = [1000 // RATE] * (moving - 1) + [int(1000.0 * HOLD)]
+        content = io.BytesIO()
+        with styled():
+            picture, frames = self._pictures(DPI), images()
+            next(frames).save(
+                content, 'gif', save_all=True, append_images=frames, duration=times, loop=0
+            )
+        return content.getvalue()
 
     def _repr_html_(self) -> str:
         """Return the film for a notebook, with buttons."""
