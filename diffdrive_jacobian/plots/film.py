@@ -181,7 +181,8 @@ class Film:
         shown = self._shown[np.linspace(0, self.frames - 1, frames).astype(int)]
         interval = 1e3 * min((self.seconds + HOLD) / frames, self._longest)
         picture = self._pictures(dpi)
-        screen = Figure(figsize=self._figure.get_size_inches(), dpi=dpi)
+        inches: Any = self._figure.get_size_inches()
+        screen = Figure(figsize=inches, dpi=dpi)
         image = screen.figimage(picture(shown[0]))
 
         def show(time: float) -> tuple[()]:
@@ -198,7 +199,8 @@ class Film:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         self._figure.set_dpi(dpi)
-        canvas, above = FigureCanvasAgg(self._figure), []
+        canvas: Any = FigureCanvasAgg(self._figure)
+        above: list[Any] = []
         for axes in self._figure.axes:
             lowest = min(one.get_zorder() for one in axes.get_children() if one.get_gid() == MOVES)
             above += [one for one in axes.get_children() if one.get_zorder() >= lowest]
