@@ -56,7 +56,7 @@ def test_damped_inverse(hand_in: HandIn) -> None:
 
 @pytest.mark.points(1)
 def test_bounded(hand_in: HandIn) -> None:
-    """As the arm stretches, joints reach the speed of the tip divided by twice the damping, not more."""
+    """Near the stretched arm joints are as fast as 1 / (2 damping) times the tip, and no faster."""
     largest = 0.0
     for bend in np.linspace(0.6, 0.0, 25):
         J = np.asarray(PlanarArm(LENGTHS).jacobian([0.3, bend])[:2])
@@ -65,3 +65,5 @@ def test_bounded(hand_in: HandIn) -> None:
     assert 4.9 < largest <= 5.0 + 1e-9, (
         f'the largest gain must rise to 1 / (2 damping) = 5 and no further, got {largest:.6g}'
     )
+    stretched = float(np.linalg.norm(inverse, 2))
+    assert stretched < 1.1, f'of the stretched arm the largest gain must be about 1, got {stretched:.6g}'

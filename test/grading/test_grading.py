@@ -52,6 +52,12 @@ WRONG = [
     ('offset_point', 'law', 'k * (np', 'np.array([k, k / 2]) * (np'),
     ('damping', 'damped_inverse bounded', 'damping**2', 'damping'),
     ('damping', 'damped_inverse', 'damping**2', '0.04'),
+    (
+        'damping',
+        'bounded',
+        'return J.T @ np',
+        'return np.eye(2) / (2 * damping) if len(J.T) == 2 else J.T @ np',
+    ),
     ('damping', 'jacobian', '-reach[1], reach', '-steps[1], steps'),
     ('null_space', 'task', '+ projector(J) @ wanted', '+ wanted'),
     ('null_space', 'wanted', '+ projector(J) @ wanted', ''),

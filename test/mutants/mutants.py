@@ -68,7 +68,7 @@ PACKAGES = (
     *('nodes', 'ros', 'parameters', 'numerics', 'properties', 'faults', 'exploration', 'testing'),
     'robot_testing',
     *('tools', 'live', 'plots', 'relations', 'diagnosis', 'drives'),
-    'grading',
+    *('grading', 'exercises'),
 )
 LEFT_OUT = {
     *('test_documents', 'test_explored_nodes', 'test_fastdds_profiles'),
