@@ -113,6 +113,16 @@ def test_wheels_are_located_between_the_steps_of_their_encoders():
         assert error[deviation == 0.0].std() < 0.5 * largest
 
 
+def test_a_wheel_that_turns_back_is_somewhere_within_the_step():
+    time = np.arange(100) * 0.02
+    # It turns back in the middle of a step, as long as it takes for any other.
+    angles = 0.095 - np.abs(time - 0.99) * 0.1
+    _, deviation = between_readings(time, np.round(angles, 2))
+    uncertain = np.flatnonzero(deviation)
+    assert 2 <= len(uncertain) <= 12
+    assert uncertain.mean() == pytest.approx(49.5, abs=1.0)
+
+
 def test_wheels_at_4_hz_are_interpolated():
     """The rates of a robot with finite accelerations change little between the samples."""
     time = np.arange(0.0, 20.0, 0.25)

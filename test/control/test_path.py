@@ -173,6 +173,15 @@ def test_errors_are_in_the_frame_of_the_reference():
     assert_allclose(batch.across, [0.1] * 4)
 
 
+def test_a_path_gets_the_times_of_a_constant_speed_without_repeated_positions():
+    path = Path(np.array([(0, 0), (0, 0), (1, 0), (1, 0), (1, 2)], dtype=float))
+    timed = path.timed(0.5)
+    assert timed.times.tolist() == pytest.approx(path.arc_lengths[[0, 2, 4]] / 0.5)
+    assert timed.poses.tolist() == path.poses[[0, 2, 4]].tolist()
+    with pytest.raises(ValueError, match='speed must be positive'):
+        path.timed(0.0)
+
+
 def test_a_trajectory_keeps_its_times_and_its_pauses():
     angle = np.linspace(0.0, 1.5, 16)
     t = angle / 0.4

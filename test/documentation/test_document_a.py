@@ -55,8 +55,7 @@ def test_saturated_actuators_do_not_follow():
     assert last[1, 1] > 0.4  # through it: stuck
 
 
-def test_the_columns_of_s_are_never_parallel_and_the_manipulators_are_where_it_is_singular():
-    close(np.linalg.norm(np.cross(S[..., 0], S[..., 1]), axis=-1), 1.0)
+def test_the_columns_of_a_manipulator_are_parallel_where_it_is_singular():
     J = PlanarArm([0.5, 0.4]).jacobian([[0.3, 0.0], [0.3, np.pi], [0.3, 0.9]])
     parallel = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
     close(parallel, [0.0, 0.0, 0.2 * np.sin(0.9)])

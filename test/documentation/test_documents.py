@@ -101,12 +101,6 @@ def test_a_script_prints_these_numbers():
     close(dd.wheel_to_world_jacobian(state[2], 0.033, 0.16) @ wheels, S @ [v, omega])
 
 
-def test_a_s_has_rank_2_for_every_heading():
-    S = dd.unicycle_jacobian(HEADINGS)
-    assert np.all(np.linalg.matrix_rank(S) == 2)
-    close(dd.no_lateral_slip_constraint(HEADINGS) @ S, 0.0)
-
-
 def test_a_two_links_near_a_singularity_ask_for_impossible_speeds_and_damping_bounds_them():
     arm, x_dot = PlanarArm([0.5, 0.5]), np.array([0.1, 0.0])
     q = np.column_stack([np.zeros(4), [1.0, 1e-2, 1e-4, 1e-6]])

@@ -122,12 +122,6 @@ def test_the_first_example_gives_the_numbers_in_its_comments():
     assert re.findall(r'-?\d+\.\d{3}', comments)[:7] == [f'{value:.3f}' for value in values]
 
 
-def test_two_commands_of_one_line_each():
-    drive, test = re.findall(r'^python3 -m venv .*$', TEXTS['README.md'], re.MULTILINE)
-    assert drive.endswith('drive_to 1 1')
-    assert test.endswith('pytest -n auto')
-
-
 def test_workflow_is_valid_yaml():
     (code,) = [block.code for block in BLOCKS if (block.file or '').startswith('.github/')]
     assert yaml.safe_load(code)['jobs']

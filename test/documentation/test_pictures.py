@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import itertools
 import re
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -216,13 +215,4 @@ def test_a_file_without_an_arm_is_refused(folder, text):
 )
 def test_mistakes_are_reported(folder, arguments, code, message):
     assert re.match(message, commands.refused('plot_jacobian', *arguments, code=code))
-    assert not list(folder.iterdir())
-
-
-def test_without_matplotlib_the_remedy_is_reported(folder, monkeypatch):
-    for name in [name for name in sys.modules if name.partition('.')[0] == 'matplotlib']:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, 'matplotlib', None)
-    message = commands.refused('plot_jacobian', 'geometry')
-    assert message == "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'"
     assert not list(folder.iterdir())

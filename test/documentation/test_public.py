@@ -28,7 +28,6 @@ import pytest
 from documentation import pages
 
 import diffdrive_jacobian
-from diffdrive_jacobian import kinematics
 
 PACKAGE = diffdrive_jacobian.__name__
 PACKAGES = [one.name for one in pkgutil.iter_modules(diffdrive_jacobian.__path__) if one.ispkg]
@@ -64,16 +63,6 @@ def test_a_package_is_public_or_says_that_it_is_internal():
         others = {one for one, value in vars(package).items() if not inspect.ismodule(value)}
         others = {one for one in others - {*public} if not one.startswith('_')}
         assert others <= {'annotations', 'TYPE_CHECKING'}, name
-
-
-def test_classes_of_modules_have_a_short_path_beside():
-    for name, module in (
-        ('PlanarArm', 'planar_arm'),
-        ('SpatialArm', 'spatial_arm'),
-        ('MobileManipulator', 'mobile_manipulator'),
-    ):
-        assert getattr(kinematics, name) is getattr(getattr(kinematics, module), name)
-        assert name in dir(kinematics)
 
 
 def test_pages_import_public_names():

@@ -155,7 +155,11 @@ def test_a_thread_in_cpp_that_waits_on_wall_time_is_warned_of(monkeypatch):
 @compiled
 @pytest.mark.parametrize(('root', 'first'), [(0, 5), (32760, 32761)])
 def test_of_those_that_are_due_at_once_the_oldest_thread_is_first(root, first, monkeypatch, tmp_path):
-    """Also where the system begins anew with small ids, after the largest one."""
+    """Also where the system begins anew with small ids, after the largest one.
+
+    A process with the id 32760 has started the threads 32761, 5 and 300. A negative id means that the
+    thread waits as an executor.
+    """
     monkeypatch.setattr(wall_time, 'PID_MAX', tmp_path / 'pid_max')
     wall_time.PID_MAX.write_text('32768\n')
     there = wall_time.WallTime(1)

@@ -163,6 +163,11 @@ def test_only_the_last_stamps_are_remembered():
     newest, oldest = 3 * MAX_KNOWN - 1, 2 * MAX_KNOWN
     for second, goal in ((oldest, oldest), (newest, newest), (oldest - 1, None)):
         assert follower.reported(SUCCEEDED, (second, 1)).goal == goal
+    # One that is used again is the newest one.
+    follower.sent('again', (oldest + 1, 1))
+    for second in range(1, MAX_KNOWN):
+        follower.sent(second, (newest + second, 1))
+    assert follower.reported(ACCEPTED, (oldest + 1, 1)).goal == 'again'
 
 
 def test_states_are_those_of_action_msgs_and_either_active_or_ended():

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import sys
 
@@ -52,7 +53,9 @@ def test_the_kernel_counts_what_it_drops(receiver):
     assert watched.dropped(begun, begun + 10**10)
     assert not watched.dropped(watched.last + 1, watched.last + 10**10)
     assert not watched.dropped(begun - 10**10, begun)
+    opened = len(os.listdir('/proc/self/fd'))
     watched.close()
+    assert len(os.listdir('/proc/self/fd')) < opened
     watched.look()
     assert watched.last < overflow.time.time_ns()
 

@@ -112,7 +112,7 @@ def test_drive_to_arrives_and_is_not_discovered(world, monkeypatch):
     # The older variable does not open it.
     monkeypatch.setenv('ROS_LOCALHOST_ONLY', '1')
     hidden = (*FAST, '-r', '__ns:=/hidden')
-    child = world.start('drive_to', '--no-record', '0.1', '0', '-1e-1', '-.1', *hidden)
+    child = world.start('drive_to', '--no-record', '0.1', '0', '-1e0', '-1.', *hidden)
     peer, seen = world.harness.peer, set()
     while child.running:
         world.harness.executor.spin_once(timeout_sec=0.01)
@@ -123,7 +123,7 @@ def test_drive_to_arrives_and_is_not_discovered(world, monkeypatch):
     assert (child.exit(), child.stderr) == (0, '')
     first = child.stdout.splitlines()[0]
     assert re.match(r'goal 1/2 \(0.1, 0\) +0.100 m to go, wheels left +0.00, right', first)
-    assert 'goal 2/2 (-0.1, -0.1)' in child.stdout
+    assert 'goal 2/2 (-1, -1)' in child.stdout
     numbers = re.fullmatch(
         r'arrived: the robot stopped at x (\S+) m, y (\S+) m, heading \S+ rad, '
         r'(\S+) m from the goal, after \S+ s',
@@ -131,7 +131,7 @@ def test_drive_to_arrives_and_is_not_discovered(world, monkeypatch):
     )
     x, y, distance = map(float, numbers.groups())
     assert distance <= 0.02
-    assert math.dist((x, y), (-0.1, -0.1)) <= 0.021
+    assert math.dist((x, y), (-1.0, -1.0)) <= 0.021
 
 
 def test_drive_to_open_survives_invalid_messages_and_reports_where_the_robot_stopped(world):
