@@ -111,7 +111,9 @@ def test_no_wait_leaves_the_goal_and_ctrl_c_cancels_it(world):
 def test_drive_to_arrives_and_is_not_discovered(world, monkeypatch):
     # The older variable does not open it.
     monkeypatch.setenv('ROS_LOCALHOST_ONLY', '1')
-    hidden = (*FAST, '-r', '__ns:=/hidden')
+    # On a busy machine nodes may wait for each other, which is warned of.
+    patient = ('-p', 'cmd_vel_timeout:=60.0', '-p', 'odom_timeout:=60.0')
+    hidden = (*FAST, *patient, '-r', '__ns:=/hidden')
     child = world.start('drive_to', '--no-record', '0.1', '0', '-1e0', '-1.', *hidden)
     peer, seen = world.harness.peer, set()
     while child.running:
