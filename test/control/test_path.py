@@ -173,7 +173,7 @@ def test_errors_are_in_the_frame_of_the_reference():
     assert_allclose(batch.across, [0.1] * 4)
 
 
-def test_a_path_gets_the_times_of_a_constant_speed_without_repeated_positions():
+def test_a_path_gets_times_by_a_speed():
     path = Path(np.array([(0, 0), (0, 0), (1, 0), (1, 0), (1, 2)], dtype=float))
     timed = path.timed(0.5)
     assert timed.times.tolist() == pytest.approx(path.arc_lengths[[0, 2, 4]] / 0.5)

@@ -36,40 +36,59 @@ pytestmark = pytest.mark.process
 
 PAGE = Path(__file__).parents[2] / 'doc' / 'solutions.md'
 SOLUTIONS = dict(re.findall(r'```python\n# (\w+)\.py\n(.*?)```', PAGE.read_text(), flags=re.DOTALL))
-WRONG = [
-    ('wheels', 'jacobian turning_in_place', 'r / L, -r / L', '-r / L, r / L'),
-    ('wheels', 'inverse', '1 / r, -L', '1 / r, L'),
-    ('angles', 'wrap bearing_error', 'np.arctan2(np.sin(angle), np.cos(angle))', 'angle % (2 * np.pi)'),
-    ('angles', 'arrays', 'np.arctan2(np.sin(angle), np.cos(angle))', 'math.remainder(angle, math.tau)'),
-    ('gains', 'gains', '6.0, 1.5', '1.5, 6.0'),
-    ('gains', 'error_rate', 'e + kv', 'e - kv'),
-    ('gains', 'turns_to_goal', 'kp > kv', 'kp > kv / 2'),
-    ('three_laws', 'straight', 'math.hypot(dx, dy), 3.0 * error', 'math.hypot(dx, dy), 0.01'),
-    ('three_laws', 'as_short_as_others', 'return 0.0, 3.0 * error', 'return -0.5, 3.0 * error'),
-    ('three_laws', 'corners', '0.5 * math.hypot', '0.005 * math.hypot'),
-    ('offset_point', 'inverse', '-sine / d', 'sine / d'),
-    ('offset_point', 'jacobian', '-d * sine', 'd * sine'),
-    ('offset_point', 'law', 'k * (np', 'np.array([k, k / 2]) * (np'),
-    ('damping', 'damped_inverse bounded', 'damping**2', 'damping'),
-    ('damping', 'damped_inverse', 'damping**2', '0.04'),
-    (
-        'damping',
-        'bounded',
-        'return J.T @ np',
-        'return np.eye(2) / (2 * damping) if len(J.T) == 2 else J.T @ np',
-    ),
-    ('damping', 'jacobian', '-reach[1], reach', '-steps[1], steps'),
-    ('null_space', 'task', '+ projector(J) @ wanted', '+ wanted'),
-    ('null_space', 'wanted', '+ projector(J) @ wanted', ''),
-    ('null_space', 'projector', '- np.linalg.pinv(J) @ J', '- J.T @ J'),
-    ('limits', 'limited limited_wheels', 'v / scale, omega / scale', 'v / scale, omega'),
-    ('limits', 'gains', '3.0 * max_omega', '0.1 * max_omega'),
-    ('eight', 'errors', 'cosine * dx + sine', 'cosine * dx - sine'),
-    ('eight', 'on_the_path eight slip', '2.0 * along, omega', '2.0 * along, 0.5 * omega'),
-    ('lost_odometry', 'old_pose in_lockstep', 'age > 0.3', 'age > 3.0'),
-    ('lost_odometry', 'before_odometry', 'pose is None or ', ''),
-]
-"""Exercise, its tests that notice a mistake, and what students may write instead of what is right."""
+WRONG = {
+    'wheels': [
+        ('jacobian turning_in_place', 'r / L, -r / L', '-r / L, r / L'),
+        ('inverse', '1 / r, -L', '1 / r, L'),
+    ],
+    'angles': [
+        ('wrap bearing_error', 'np.arctan2(np.sin(angle), np.cos(angle))', 'angle % (2 * np.pi)'),
+        ('arrays', 'np.arctan2(np.sin(angle), np.cos(angle))', 'math.remainder(angle, math.tau)'),
+    ],
+    'gains': [
+        ('gains', '6.0, 1.5', '1.5, 6.0'),
+        ('error_rate', 'e + kv', 'e - kv'),
+        ('turns_to_goal', 'kp > kv', 'kp > kv / 2'),
+    ],
+    'three_laws': [
+        ('straight', 'math.hypot(dx, dy), 3.0 * error', 'math.hypot(dx, dy), 0.01'),
+        ('as_short_as_others', 'return 0.0, 3.0 * error', 'return -0.5, 3.0 * error'),
+        ('corners', '0.5 * math.hypot', '0.005 * math.hypot'),
+    ],
+    'offset_point': [
+        ('inverse', '-sine / d', 'sine / d'),
+        ('jacobian', '-d * sine', 'd * sine'),
+        ('law', 'k * (np', 'np.array([k, k / 2]) * (np'),
+    ],
+    'damping': [
+        ('damped_inverse bounded', 'damping**2', 'damping'),
+        ('damped_inverse', 'damping**2', '0.04'),
+        (
+            'bounded',
+            'return J.T @ np',
+            'return np.eye(2) / (2 * damping) if len(J.T) == 2 else J.T @ np',
+        ),
+        ('jacobian', '-reach[1], reach', '-steps[1], steps'),
+    ],
+    'null_space': [
+        ('task', '+ projector(J) @ wanted', '+ wanted'),
+        ('wanted', '+ projector(J) @ wanted', ''),
+        ('projector', '- np.linalg.pinv(J) @ J', '- J.T @ J'),
+    ],
+    'limits': [
+        ('limited limited_wheels', 'v / scale, omega / scale', 'v / scale, omega'),
+        ('gains', '3.0 * max_omega', '0.1 * max_omega'),
+    ],
+    'eight': [
+        ('errors', 'cosine * dx + sine', 'cosine * dx - sine'),
+        ('on_the_path eight slip', '2.0 * along, omega', '2.0 * along, 0.5 * omega'),
+    ],
+    'lost_odometry': [
+        ('old_pose in_lockstep', 'age > 0.3', 'age > 3.0'),
+        ('before_odometry', 'pose is None or ', ''),
+    ],
+}
+"""Tests that notice a mistake, what is right, and what students may write."""
 
 
 def named_tests(exercise):
@@ -84,9 +103,9 @@ def try_tests(tmp_path, exercise, source, names):
     file.write_text(source)
     for name in names:
         test, hand_in = named_tests(exercise)[name], HandIn(file)
-        pictures = {'save_picture': bool} if 'save_picture' in inspect.signature(test).parameters else {}
+        draws = 'save_picture' in inspect.signature(test).parameters
         try:
-            test(hand_in, **pictures)
+            test(hand_in, *[bool] * draws)
         except AssertionError:
             failed.append(name)
         finally:
@@ -94,11 +113,11 @@ def try_tests(tmp_path, exercise, source, names):
     return failed
 
 
-def test_each_exercise_has_a_solution_and_each_of_its_tests_points_and_a_mistake():
+def test_each_exercise_is_complete():
     assert exercises() == sorted(SOLUTIONS)
     for exercise in SOLUTIONS:
         tests = named_tests(exercise)
-        assert {*' '.join(names for name, names, *_ in WRONG if name == exercise).split()} == {*tests}
+        assert {*' '.join(names for names, *_ in WRONG[exercise]).split()} == {*tests}
         assert all('points' in [mark.name for mark in test.pytestmark] for test in tests.values())
 
 
@@ -107,7 +126,10 @@ def test_a_solution_passes(tmp_path, exercise):
     assert try_tests(tmp_path, exercise, SOLUTIONS[exercise], named_tests(exercise)) == []
 
 
-@pytest.mark.parametrize(('exercise', 'names', 'right', 'wrong'), WRONG)
+@pytest.mark.parametrize(
+    ('exercise', 'names', 'right', 'wrong'),
+    [(exercise, *one) for exercise, mistakes in WRONG.items() for one in mistakes],
+)
 def test_a_mistake_is_noticed(tmp_path, exercise, names, right, wrong):
     source = SOLUTIONS[exercise]
     assert right in source
@@ -150,7 +172,7 @@ def test_robot(hand_in):
 
 
 def test_a_table_has_points_and_reasons_that_no_spreadsheet_obeys(tmp_path):
-    """Also of files of one name, of a name that is no UTF-8, and of a text that cannot be written."""
+    """Also of files of one name, and of names and texts that are no UTF-8."""
     exercise = tmp_path / 'exercise.py'
     exercise.write_text(EXERCISE)
     twice = 'def twice(a): return 2 * a\ndef thrice(a): '

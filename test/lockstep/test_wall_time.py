@@ -157,8 +157,8 @@ def test_a_thread_in_cpp_that_waits_on_wall_time_is_warned_of(monkeypatch):
 def test_of_those_that_are_due_at_once_the_oldest_thread_is_first(root, first, monkeypatch, tmp_path):
     """Also where the system begins anew with small ids, after the largest one.
 
-    A process with the id 32760 has started the threads 32761, 5 and 300. A negative id means that the
-    thread waits as an executor.
+    A process 32760 has started the threads 32761, 5 and 300.
+    A negative id is of one that waits as an executor.
     """
     monkeypatch.setattr(wall_time, 'PID_MAX', tmp_path / 'pid_max')
     wall_time.PID_MAX.write_text('32768\n')

@@ -319,7 +319,13 @@ def test_a_file_that_cannot_be_finished_is_removed_and_does_not_keep_the_other(f
     assert [one.name for one in folder.iterdir()] == ['a.png']
 
 
-@pytest.mark.parametrize('command', [('plot_run', REAL, '-o', 'a.png'), ('plot_jacobian', 'geometry')])
+@pytest.mark.parametrize(
+    'command',
+    [
+        ('plot_run', REAL, '-o', 'a.png'),
+        ('plot_jacobian', 'geometry'),
+    ],
+)
 def test_without_matplotlib_the_remedy_is_reported(folder, monkeypatch, command):
     for name in [name for name in sys.modules if name.split('.')[0] == 'matplotlib']:
         monkeypatch.delitem(sys.modules, name)
